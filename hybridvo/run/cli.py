@@ -1,6 +1,6 @@
 """The command line: parse the arguments, call a function, print its result or its error.
 
-``commands/arguments.py`` states which function of ``commands/dispatch.py`` a command calls.
+``commands/arguments.py`` states what a command calls, ``commands/dispatch.py`` calls it.
 
 Exit codes: 0 done, 1 a bug (or ``doctor`` found something), 2 bad input, 3 too many failed frames,
 4 folder locked, 5 output cannot be written, 128 + N stopped by signal N (130: interrupted).

@@ -85,7 +85,7 @@ def test_the_next_command_takes_what_the_run_took() -> None:
     program, *found = shlex.split(command_that_shows(args, 7))
     assert program == "hybridvo"
     show = build_parser().parse_args(found)
-    assert (show.sequence, show.frame, show.method) == ("my walk", 7, "classical")
+    assert (show.sequence, show.pair, show.method) == ("my walk", 6, "classical")
     for name in ("camera", "depth_scale", "trust", "flow", "stereo"):
         assert getattr(show, name) == getattr(args, name), name
 

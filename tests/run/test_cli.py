@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import dataclasses
 import errno
 import io
 import json
 import logging
 import os
 import shutil
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 
 import filelock
@@ -15,12 +18,11 @@ import pytest
 from hybridvo import __version__
 from hybridvo.core.errors import printable
 from hybridvo.core.files import LOCK
-from hybridvo.core.options import option_defaults
+from hybridvo.core.options import RunOptions, option_defaults
 from hybridvo.core.results import Reason
 from hybridvo.run.cli import main
-from hybridvo.run.commands import dispatch
 from hybridvo.run.commands.advice import advice_on
-from hybridvo.run.commands.arguments import build_parser
+from hybridvo.run.commands.arguments import COMMANDS, TRAINING_COMMANDS
 from hybridvo.run.commands.terminal import printable_content, table
 from hybridvo.run.commands.text import text_of
 
@@ -362,14 +364,39 @@ def test_a_table_keeps_every_digit(monkeypatch):
         assert "classical" in text
 
 
-@pytest.mark.parametrize("name", ["run", "compare", "doctor", "train"])
-def test_every_command_names_the_function_that_it_calls(name):
-    words = {
-        "run": ["run", "x"],
-        "compare": ["compare", "x"],
-        "doctor": ["doctor"],
-        "train": ["train", "export", "--out", "x", "--export", "y"],
-    }[name]
-    function = build_parser().parse_args(words).call
-    expected = "export_weights" if name == "train" else name
-    assert function is getattr(dispatch, expected)
+CALLED = {
+    "run": ["hybridvo.run.commands.run:run"],
+    "live": [
+        "hybridvo.run.commands.live:live",
+        "hybridvo.io.cameras.choose:choose_camera",
+    ],
+    "evaluate": [
+        "hybridvo.lab.evaluation.metrics:evaluate",
+        "hybridvo.lab.evaluation.path_scores:evaluate_path",
+    ],
+    "doctor": [
+        "hybridvo.run.commands.doctor:diagnose",
+        "hybridvo.run.commands.doctor:diagnose_camera",
+    ],
+    "pwvo": ["hybridvo.run.commands.train:train_network"],
+    "paper": ["hybridvo.run.commands.train:train_network"],
+}
+"""What the commands call that are more than a call."""
+PREPARED = {"weights", "jobs", "cluster", "config", "assignments", "flow", "speed"}
+"""Arguments from which models, workers and options are made, or that choose what is called."""
+
+
+@pytest.mark.parametrize(
+    "command", [*COMMANDS, *TRAINING_COMMANDS], ids=lambda command: command.name
+)
+def test_every_argument_is_taken(command):
+    """Arguments are passed by name: one with a name that nothing takes would do nothing."""
+    taken = PREPARED | {option.name for option in dataclasses.fields(RunOptions)}
+    places = CALLED.get(command.name) or command.call.args
+    for place in (*places, "hybridvo.io.data.open:open_sequence"):
+        module, _, name = place.partition(":")
+        taken |= set(signature(getattr(import_module(module), name)).parameters)
+    for part in command.arguments:
+        for names, settings in getattr(part, "arguments", [part]):
+            name = settings.get("dest", names[0].lstrip("-").replace("-", "_"))
+            assert name in taken, names

@@ -1,21 +1,23 @@
-"""The arguments of every command, and the function in ``dispatch`` that it calls.
+"""The commands: a record for each, with its arguments and what it calls.
 
-Help must be instant: nothing here imports a heavy module.
+An argument has the name of the parameter that it sets, or of an option, see
+:mod:`hybridvo.run.commands.dispatch`. Help must be instant: nothing here imports a heavy module.
 """
 
 from __future__ import annotations
 
 import re
-from argparse import SUPPRESS, Action, ArgumentParser, Namespace
+from argparse import SUPPRESS, Action, ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hybridvo import __version__
 from hybridvo.core.errors import did_you_mean, printable
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.run.calibration import DOCTOR_SECONDS
 from hybridvo.run.commands import dispatch
+from hybridvo.run.commands.dispatch import Outcome, calling
 
 FLOWS = ("auto", "file", "dis")
 NETWORK = "onnx:"
@@ -27,13 +29,9 @@ PROTOCOLS = (
     *("tum-dynamics", "tum-walking", "bonn8", "bonn9"),
 )
 """Names in ``evaluation/protocols.yaml``."""
-COUNT: dict[str, Any] = {"type": int, "metavar": "N"}
-"""How a whole number is given."""
-FLAG: dict[str, Any] = {"action": "store_true"}
-"""How a switch is given."""
 CAMERA_HELP = "camera.yaml, ROS camera_info, or numbers"
 """What ``--camera`` is of a sequence."""
-OPTIONS = Path(__file__).parents[1] / "odometry.yaml"
+OPTIONS_FILE = Path(__file__).parents[1] / "odometry.yaml"
 """The file that explains every option, with its default."""
 KEY_WIDTH = 32
 """Width of the keys in what ``--set help`` prints, characters."""
@@ -89,7 +87,7 @@ def options_for_people() -> str:
     """Return a line for each option: what ``--set`` takes, with its default, and the meaning."""
     lines = []
     group = ""
-    for line in OPTIONS.read_text(encoding="utf-8").splitlines():
+    for line in OPTIONS_FILE.read_text(encoding="utf-8").splitlines():
         if heading := re.fullmatch(r"(\w+):", line):
             group = heading[1]
         elif option := re.fullmatch(r"  (\w+): (\S+) +# (.*)", line):
@@ -99,161 +97,7 @@ def options_for_people() -> str:
     return "\n".join(lines)
 
 
-def build_parser() -> ArgumentParser:
-    """Make the parser of the command line.
-
-    The parsed arguments have the function to call in ``call``.
-    """
-    about = "Metric camera motion with covariance from optical flow, depth and intrinsics."
-    parser = Parser(prog="hybridvo", description=about)
-    parser.add_argument(
-        "--version", action="version", version=f"hybridvo {__version__}"
-    )
-    commands = parser.add_subparsers(
-        dest="command", required=True, metavar="COMMAND"
-    )
-    _add_run(commands)
-    _add_live(commands)
-    _add_compare(commands)
-    _add_show(commands)
-    _add_evaluate(commands)
-    _add_doctor(commands)
-    _add_topics(commands)
-    _add_convert(commands)
-    _add_demo(commands)
-    _add_generate(commands)
-    _add_init(commands)
-    _add_train(commands)
-    return parser
-
-
-def _command(
-    commands: Any,
-    name: str,
-    about: str,
-    call: Callable[[Namespace], dispatch.Outcome],
-) -> ArgumentParser:
-    """Add a command with the arguments that all commands have."""
-    command: ArgumentParser = commands.add_parser(
-        name, help=about, description=about
-    )
-    command.set_defaults(call=call)
-    command.add_argument(
-        "--json", help="print the result as JSON on stdout", **FLAG
-    )
-    loudness = command.add_mutually_exclusive_group()
-    loudness.add_argument("-v", "--verbose", help="tracebacks of errors", **FLAG)
-    loudness.add_argument("-q", "--quiet", help="errors only", **FLAG)
-    return command
-
-
-# -- groups of arguments that commands share ---------------------------------------------
-
-
-def _add_sequence(
-    command: ArgumentParser, required: bool = True, camera: str = CAMERA_HELP
-) -> None:
-    """Add the folder of a sequence, by place or by name."""
-    folder = command.add_mutually_exclusive_group(required=required)
-    folder.add_argument(
-        "sequence",
-        nargs="?",
-        default=SUPPRESS,
-        metavar="DIR",
-        help="folder of the sequence, or file of a recording",
-    )
-    folder.add_argument("--sequence", metavar="DIR", help="the same, by name")
-    _add_reading(command, camera)
-
-
-def _add_reading(command: ArgumentParser, camera: str = CAMERA_HELP) -> None:
-    """Add what the files of a sequence do not state."""
-    add = command.add_argument
-    kinds = (
-        "sintel, tartanair, 7scenes, folder, stereo, kitti, kitti-raw, vkitti2, "
-    )
-    kinds += (
-        "tum, openloris, rgbd-scenes, bag, euroc, arrays, strayscanner, record3d, "
-    )
-    kinds += "scannet, sens, recorder, kinect, replica, transforms or video"
-    add("--dataset", metavar="KIND", help=f"{kinds} (default: detected)")
-    add(
-        "--camera",
-        metavar="FILE|fx,fy,cx,cy",
-        help=camera,
-    )
-    add(
-        "--depth-scale",
-        type=float,
-        metavar="N",
-        help="depth units per metre, 1000: millimetres",
-    )
-    _add_times(command)
-    add(
-        "--fps",
-        type=float,
-        metavar="N",
-        help="frames a second, in place of the time stamps of the files",
-    )
-    add(
-        "--mask",
-        metavar="DIR|onnx:FILE",
-        help="images that are 0 where pixels do not count, or a network that finds people",
-    )
-    _add_depth(command)
-    topic: dict[str, Any] = {"metavar": "TOPIC"}
-    add("--topic-rgb", help="of colour, in a bag (default: guessed)", **topic)
-    add("--topic-depth", help="of depth, in a bag (default: guessed)", **topic)
-    add("--topic-info", help="of colour's CameraInfo (default: guessed)", **topic)
-    add("--topic-truth", help="of true poses (default: by its name)", **topic)
-    add(
-        "--depth-dir",
-        metavar="DIR",
-        help="depth of a video (default: depth beside)",
-    )
-    add(
-        "--stereo",
-        nargs="?",
-        const="",
-        type=metres,
-        metavar="METRES",
-        help="depth from left/ and right/; baseline of rectified images (else camera.yaml)",
-    )
-    _add_trust(command)
-
-
-def _add_trust(command: ArgumentParser) -> None:
-    """Add the way to read recordings without limits."""
-    command.add_argument(
-        "--trust",
-        help="read recordings of foreign formats here, not in a child process with limits",
-        **FLAG,
-    )
-
-
-def _add_depth(command: ArgumentParser) -> None:
-    """Add the network that predicts depth."""
-    command.add_argument(
-        "--depth",
-        metavar="onnx:FILE",
-        help="a network predicts depth (extra 'onnx'); onnx:FILE@NAME names its description",
-    )
-
-
-def _add_times(command: ArgumentParser) -> None:
-    """Add at which times a camera measures."""
-    command.add_argument(
-        "--readout-ms",
-        type=float,
-        metavar="MS",
-        help="rolling shutter: time from the first row to the last, ms (else camera.yaml)",
-    )
-    command.add_argument(
-        "--depth-lag-ms",
-        type=float,
-        metavar="MS",
-        help="how much later than the image depth is measured, ms (else camera.yaml)",
-    )
+# -- the types of arguments --------------------------------------------------------------
 
 
 def flow_source(text: str) -> str:
@@ -261,17 +105,6 @@ def flow_source(text: str) -> str:
     if text in FLOWS or text.removeprefix(NETWORK) not in ("", text):
         return text
     raise ValueError(text)
-
-
-def _add_flow(command: ArgumentParser, default: str | None = None) -> None:
-    """Add the source of the flow."""
-    command.add_argument(
-        "--flow",
-        type=flow_source,
-        default=default,
-        metavar=f"{{{','.join(FLOWS)},onnx:FILE}}",
-        help="default auto: the sequence's files, else DIS; onnx:FILE: a network (extra 'onnx')",
-    )
 
 
 def image_size(text: str) -> tuple[int, int]:
@@ -289,479 +122,572 @@ def metres(text: str) -> str:
     return text
 
 
-def _add_options(command: ArgumentParser) -> None:
-    """Add the options of :mod:`hybridvo.core.options`: some by name, all by ``--set``."""
-    add = command.add_argument
-    _add_flow(command)
-    add("--start", help="first frame (default 0)", **COUNT)
-    add("--stop", help="the one after the last frame", **COUNT)
-    add("--stride", help="step between frames (default 1)", **COUNT)
-    _add_settings(command)
+def frame_before(text: str) -> int:
+    """Return the index of the frame before one, which is that of their pair."""
+    try:
+        return int(text) - 1
+    except ValueError:
+        raise ArgumentTypeError(f"invalid int value: {text!r}") from None
 
 
-def _add_settings(command: ArgumentParser) -> None:
-    """Add the options that are no matter of frames on disk."""
-    add = command.add_argument
-    add("--seed", help="of everything drawn at random", **COUNT)
-    add("--device", choices=DEVICES, help="of the networks (default auto)")
-    add("--config", metavar="FILE", help="YAML file of options")
-    add(
-        "--set",
+def names(text: str) -> tuple[str, ...]:
+    """Split names at commas."""
+    return tuple(text.replace(" ", "").split(","))
+
+
+# -- the kinds of arguments --------------------------------------------------------------
+
+
+class Argument(NamedTuple):
+    """An argument as argparse takes it."""
+
+    names: tuple[str, ...]
+    settings: dict[str, Any]
+
+
+class Either(NamedTuple):
+    """Arguments of which one at most is given; one at least where it is required."""
+
+    arguments: tuple[Argument, ...]
+    required: bool = False
+
+
+def word(usage: str, about: str | None = None, **settings: Any) -> Argument:
+    """An argument that takes a text; ``usage`` is as in ``--camera FILE``."""
+    name, _, metavar = usage.partition(" ")
+    return Argument((name,), {"metavar": metavar or None, "help": about} | settings)
+
+
+def number(usage: str, about: str, **settings: Any) -> Argument:
+    """An argument that takes a number."""
+    return word(usage, about, type=float, **settings)
+
+
+def count(usage: str, about: str | None = None, **settings: Any) -> Argument:
+    """An argument that takes a whole number."""
+    return word(usage, about, **{"type": int} | settings)
+
+
+def switch(names: str, about: str, **settings: Any) -> Argument:
+    """An argument that takes nothing."""
+    settings = {"action": "store_true", "help": about} | settings
+    return Argument(tuple(names.split()), settings)
+
+
+# -- arguments that commands share -------------------------------------------------------
+
+LOUDNESS = (
+    switch("--json", "print the result as JSON on stdout"),
+    Either(
+        (
+            switch("-v --verbose", "tracebacks of errors"),
+            switch("-q --quiet", "errors only"),
+        )
+    ),
+)
+"""What all commands have."""
+TIMES = (
+    number(
+        "--readout-ms MS",
+        "rolling shutter: time from the first row to the last, ms (else camera.yaml)",
+    ),
+    number(
+        "--depth-lag-ms MS",
+        "how much later than the image depth is measured, ms (else camera.yaml)",
+    ),
+)
+"""At which times a camera measures."""
+TRUST = switch(
+    "--trust",
+    "read recordings of foreign formats here, not in a child process with limits",
+)
+DEPTH = word(
+    "--depth onnx:FILE",
+    "a network predicts depth (extra 'onnx'); onnx:FILE@NAME names its description",
+)
+FLOW = word(
+    f"--flow {{{','.join(FLOWS)},onnx:FILE}}",
+    "default auto: the sequence's files, else DIS; onnx:FILE: a network (extra 'onnx')",
+    type=flow_source,
+)
+KINDS = (
+    "sintel, tartanair, 7scenes, folder, stereo, kitti, kitti-raw, vkitti2, tum, openloris, "
+    "rgbd-scenes, bag, euroc, arrays, strayscanner, record3d, scannet, sens, recorder, kinect, "
+    "replica, transforms or video"
+)
+"""What ``--dataset`` may be."""
+
+
+def reading(camera: str = CAMERA_HELP) -> tuple[Argument, ...]:
+    """Return the arguments that state what the files of a sequence do not."""
+    return (
+        word("--dataset KIND", f"{KINDS} (default: detected)"),
+        word("--camera FILE|fx,fy,cx,cy", camera),
+        number("--depth-scale N", "depth units per metre, 1000: millimetres"),
+        *TIMES,
+        number(
+            "--fps N", "frames a second, in place of the time stamps of the files"
+        ),
+        word(
+            "--mask DIR|onnx:FILE",
+            "images that are 0 where pixels do not count, or a network that finds people",
+        ),
+        DEPTH,
+        word("--topic-rgb TOPIC", "of colour, in a bag (default: guessed)"),
+        word("--topic-depth TOPIC", "of depth, in a bag (default: guessed)"),
+        word("--topic-info TOPIC", "of colour's CameraInfo (default: guessed)"),
+        word("--topic-truth TOPIC", "of true poses (default: by its name)"),
+        word("--depth-dir DIR", "depth of a video (default: depth beside)"),
+        word(
+            "--stereo METRES",
+            "depth from left/ and right/; baseline of rectified images (else camera.yaml)",
+            nargs="?",
+            const="",
+            type=metres,
+        ),
+        TRUST,
+    )
+
+
+def sequence(
+    required: bool = True, camera: str = CAMERA_HELP
+) -> tuple[Argument | Either, ...]:
+    """Return the folder of a sequence, by place or by name, and how it is read."""
+    by_place = word(
+        "sequence DIR",
+        "folder of the sequence, or file of a recording",
+        nargs="?",
+        default=SUPPRESS,
+    )
+    by_name = word("--sequence DIR", "the same, by name")
+    return Either((by_place, by_name), required), *reading(camera)
+
+
+FRAMES = (
+    count("--start N", "first frame (default 0)"),
+    count("--stop N", "the one after the last frame"),
+    count("--stride N", "step between frames (default 1)"),
+)
+SETTINGS = (
+    count("--seed N", "of everything drawn at random"),
+    word("--device", "of the networks (default auto)", choices=DEVICES),
+    word("--config FILE", "YAML file of options"),
+    word(
+        "--set KEY=VALUE",
+        "one option, as in refine.cutoff=2.5; may be repeated; --set help explains the keys",
         action=SetOption,
         default=[],
         dest="assignments",
-        metavar="KEY=VALUE",
-        help=(
-            "one option, as in refine.cutoff=2.5; may be repeated; "
-            "--set help explains the keys"
-        ),
+    ),
+)
+"""Options of :mod:`hybridvo.core.options` that are no matter of frames on disk."""
+OPTIONS = (FLOW, *FRAMES, *SETTINGS)
+"""Options of :mod:`hybridvo.core.options`: some by name, all by ``--set``."""
+KEPT = {"dest": "mode", "action": "store_const", "default": "new"}
+MODE = Either(
+    (
+        switch("--resume", "go on where it was cut off", const="resume", **KEPT),
+        switch("--overwrite", "start anew", const="overwrite", **KEPT),
     )
-
-
-def _add_mode(command: ArgumentParser) -> None:
-    """Add what happens to results that are there already."""
-    exists = command.add_mutually_exclusive_group()
-    exists.add_argument(
-        "--resume",
-        dest="mode",
-        action="store_const",
-        const="resume",
-        default="new",
-        help="go on where it was cut off",
-    )
-    exists.add_argument(
-        "--overwrite",
-        dest="mode",
-        action="store_const",
-        const="overwrite",
-        default="new",
-        help="start anew",
-    )
-
-
-def _add_weights(command: ArgumentParser) -> None:
-    """Add the weights of networks."""
-    command.add_argument(
-        "--weights",
-        action="append",
-        default=[],
-        metavar="NAME=FILE",
-        help="network weights instead of the pretrained ones, as in pwvo=mine.safetensors",
-    )
-
-
-def _add_workers(command: ArgumentParser, *other_names: str) -> None:
-    """Add where independent tasks run."""
-    command.add_argument(
-        "--jobs",
-        *other_names,
-        default=1,
-        help="processes on this machine (default 1)",
-        **COUNT,
-    )
-    command.add_argument(
-        "--cluster",
-        metavar="SCHEDULER",
-        help="tcp://HOST:PORT or JSON file of a scheduler of dask.distributed, extra 'cluster'",
-    )
-
-
-def _add_training(command: ArgumentParser) -> None:
-    """Add what all training runs have."""
-    add = command.add_argument
-    add(
+)
+"""What happens to results that are there already."""
+OVERWRITE = switch("--overwrite", "replace the results in --out")
+WEIGHTS = word(
+    "--weights NAME=FILE",
+    "network weights instead of the pretrained ones, as in pwvo=mine.safetensors",
+    action="append",
+    default=[],
+)
+METHOD = word("--method NAME", "default: hybrid; hybridvo doctor lists all")
+MAX_FAILED = number(
+    "--max-failed X",
+    "exit code 3 where a larger fraction of motions fails (default 0.2)",
+)
+VIEW = word(
+    "--view WHERE",
+    "show it in Rerun (extra 'viz'): spawn (default) opens a window, connect[:HOST:PORT] takes "
+    "one that is open, serve makes a page for a browser",
+    nargs="?",
+    const="spawn",
+)
+JOBS = count("--jobs N", "processes on this machine (default 1)", default=1)
+CLUSTER = word(
+    "--cluster SCHEDULER",
+    "tcp://HOST:PORT or JSON file of a scheduler of dask.distributed, extra 'cluster'",
+)
+TRAINING = (
+    word(
         "--out",
+        "folder of the run; goes on where it was",
         type=Path,
         required=True,
-        help="folder of the run; goes on where it was",
-    )
-    add(
-        "--time-limit",
-        type=float,
-        default=float("inf"),
-        metavar="MIN",
-        help="minutes in all",
-    )
-    add(
-        "--init",
-        metavar="FILE",
-        help="start from these weights: a file, or a pretrained name",
-    )
-    add("--seed", type=int, help="instead of the configuration's")
+    ),
+    number("--time-limit MIN", "minutes in all", default=float("inf")),
+    word("--init FILE", "start from these weights: a file, or a pretrained name"),
+    count("--seed", "instead of the configuration's"),
+)
+"""What all training runs have."""
+SHARDS = word("--data", "folder of the shards", type=Path, required=True)
+
+# -- the commands, with their arguments in the order of --help ---------------------------
 
 
-# -- commands on sequences ---------------------------------------------------------------
+class Command(NamedTuple):
+    """A command of the program."""
+
+    name: str
+    about: str
+    call: Callable[[Namespace], Outcome]
+    arguments: tuple[Argument | Either, ...]
+    # those of shared arguments, where the command has its own
+    defaults: dict[str, Any]
 
 
-def _add_run(commands: Any) -> None:
-    about = "Estimate the camera motion of a sequence."
-    command = _command(commands, "run", about, dispatch.run)
-    _add_sequence(command)
-    _add_options(command)
-    _add_mode(command)
-    _add_weights(command)
-    add = command.add_argument
-    add("--out", metavar="DIR", help="output folder (default: runs/NAME)")
-    add(
-        "--method",
-        metavar="NAME",
-        help="default: hybrid; hybridvo doctor lists all",
-    )
-    add(
-        "--max-failed",
-        type=float,
-        metavar="X",
-        help="exit code 3 where a larger fraction of motions fails (default 0.2)",
-    )
-    add("--strict", default=None, help="a broken frame ends the run", **FLAG)
-    add(
-        "--passes",
-        help="times the sequence is tracked (default 1); 3 for a rolling shutter in quick turns",
-        **COUNT,
-    )
-    add(
-        "--rrd",
+def command(
+    name: str,
+    about: str,
+    call: Callable[[Namespace], Outcome],
+    *arguments: Argument | Either,
+    **defaults: Any,
+) -> Command:
+    """Return the record of a command."""
+    return Command(name, about, call, arguments, defaults)
+
+
+RUN = command(
+    "run",
+    "Estimate the camera motion of a sequence.",
+    dispatch.run,
+    *sequence(),
+    *OPTIONS,
+    MODE,
+    WEIGHTS,
+    word("--out DIR", "output folder (default: runs/NAME)"),
+    METHOD,
+    MAX_FAILED,
+    switch("--strict", "a broken frame ends the run", default=None),
+    count(
+        "--passes N",
+        "times the sequence is tracked (default 1); 3 for a rolling shutter in quick turns",
+    ),
+    word(
+        "--rrd FILE",
+        "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)",
         nargs="?",
         const="",
-        metavar="FILE",
-        help=(
-            "Rerun recording (extra 'viz'; default: recording.rrd in the output folder)"
-        ),
-    )
-    _add_view(command)
-    add(
-        "--export",
-        type=_names,
-        default=[],
-        metavar="KINDS",
-        help="images, masks and poses for colmap, transforms, euroc (comma-separated)",
-    )
-
-
-def _add_view(command: ArgumentParser) -> None:
-    """Add the viewer that shows a run while it goes on."""
-    command.add_argument(
-        "--view",
-        nargs="?",
-        const="spawn",
-        metavar="WHERE",
-        help=(
-            "show it in Rerun (extra 'viz'): spawn (default) opens a window, "
-            "connect[:HOST:PORT] takes one that is open, serve makes a page for a browser"
-        ),
-    )
-
-
-def _add_live(commands: Any) -> None:
-    about = "Estimate the motion of a camera while it moves; Ctrl-C ends it."
-    command = _command(commands, "live", about, dispatch.live)
-    command.set_defaults(start=None, stop=None, stride=None, strict=None)
-    _add_weights(command)
-    add = command.add_argument
-    add(
-        "--camera",
-        metavar="NAME|DIR",
-        help="realsense, oak, orbbec (each with :SERIAL), opencv:0, or a recording",
-    )
-    add("--preset", metavar="NAME|FILE", help="settings, as d435 or d435.yaml")
-    _add_times(command)
-    _add_trust(command)
-    _add_flow(command)
-    _add_depth(command)
-    add("--mask", metavar="onnx:FILE", help="a network finds people (extra 'onnx')")
-    add(
+    ),
+    VIEW,
+    word(
+        "--export KINDS",
+        "images, masks and poses for colmap, transforms, euroc (comma-separated)",
+        type=names,
+        default=(),
+    ),
+)
+LIVE = command(
+    "live",
+    "Estimate the motion of a camera while it moves; Ctrl-C ends it.",
+    dispatch.live,
+    WEIGHTS,
+    word(
+        "--camera NAME|DIR",
+        "realsense, oak, orbbec (each with :SERIAL), opencv:0, or a recording",
+    ),
+    word("--preset NAME|FILE", "settings, as d435 or d435.yaml"),
+    *TIMES,
+    TRUST,
+    FLOW,
+    DEPTH,
+    word("--mask onnx:FILE", "a network finds people (extra 'onnx')"),
+    switch(
         "--no-imu",
+        "leave the camera's IMU alone (default: used where there is one)",
         dest="imu",
         action="store_false",
-        help="leave the camera's IMU alone (default: used where there is one)",
-    )
-    add("--out", metavar="DIR", help="output folder (default: runs/live-DATE-TIME)")
-    add("--overwrite", help="replace the results in --out", **FLAG)
-    add("--seconds", type=float, metavar="S", help="end after so long")
-    add("--max-frames", help="end after so many frames", **COUNT)
-    add(
-        "--size",
+    ),
+    word("--out DIR", "output folder (default: runs/live-DATE-TIME)"),
+    OVERWRITE,
+    number("--seconds S", "end after so long"),
+    count("--max-frames N", "end after so many frames"),
+    word(
+        "--size WxH",
+        "make images and depth smaller, as 320x240 (default: the camera's)",
         type=image_size,
-        metavar="WxH",
-        help="make images and depth smaller, as 320x240 (default: the camera's)",
-    )
-    add(
+    ),
+    word(
         "--rate",
+        "auto: measure, then choose size, flow and budget that keep up",
         choices=("camera", "auto"),
         default="camera",
-        help="auto: measure, then choose size, flow and budget that keep up",
-    )
-    add("--udp", metavar="HOST:PORT", help="send each step as a line of JSON")
-    add("--rrd", metavar="FILE", help="Rerun recording (extra 'viz')")
-    _add_view(command)
-    add(
-        "--method",
-        metavar="NAME",
-        help="default: hybrid; hybridvo doctor lists all",
-    )
-    add(
-        "--max-failed",
-        type=float,
-        metavar="X",
-        help="exit code 3 where a larger fraction of motions fails (default 0.2)",
-    )
-    _add_settings(command)
-
-
-def _add_compare(commands: Any) -> None:
-    about = "Run methods side by side and write a report."
-    command = _command(commands, "compare", about, dispatch.compare)
-    _add_reading(command)
-    _add_options(command)
-    _add_mode(command)
-    _add_weights(command)
-    add = command.add_argument
-    add(
-        "--sequence",
+    ),
+    word("--udp HOST:PORT", "send each step as a line of JSON"),
+    word("--rrd FILE", "Rerun recording (extra 'viz')"),
+    VIEW,
+    METHOD,
+    MAX_FAILED,
+    *SETTINGS,
+)
+COMPARE = command(
+    "compare",
+    "Run methods side by side and write a report.",
+    calling("hybridvo.run.commands.compare:compare"),
+    *reading(),
+    *OPTIONS,
+    MODE,
+    WEIGHTS,
+    word(
+        "--sequence DIR",
+        "the same as DIR, by name; repeatable",
         dest="sequences",
         action="extend",
         nargs="+",
         default=[],
-        metavar="DIR",
-        help="the same as DIR, by name; repeatable",
-    )
-    add(
-        "sequences",
+    ),
+    word(
+        "sequences DIR",
+        "sequences, or folders of sequences (MPI Sintel as it was unpacked)",
         action="extend",
         nargs="*",
         default=SUPPRESS,
-        metavar="DIR",
-        help="sequences, or folders of sequences (MPI Sintel as it was unpacked)",
-    )
-    add("--out", default="runs/compare", metavar="DIR", help="default: %(default)s")
-    add(
+    ),
+    word("--out DIR", "default: %(default)s", default="runs/compare"),
+    word(
         "--methods",
-        type=_names,
+        "comma-separated; default: all that run here",
+        type=names,
         default="all",
-        help="comma-separated; default: all that run here",
-    )
-    add(
+    ),
+    word(
         "--protocol",
+        "score a data set as papers do: docs/protocols.md",
         choices=PROTOCOLS,
-        help="score a data set as papers do: docs/protocols.md",
-    )
-    _add_workers(command)
-
-
-def _names(text: str) -> list[str]:
-    """Split names at commas."""
-    return text.replace(" ", "").split(",")
-
-
-def _add_show(commands: Any) -> None:
-    about = "Draw the maps of one pair of a sequence."
-    command = _command(commands, "show", about, dispatch.show)
-    _add_sequence(command)
-    _add_weights(command)
-    add = command.add_argument
-    pair = command.add_mutually_exclusive_group()
-    pair.add_argument("--pair", default=0, help="first frame (default 0)", **COUNT)
-    pair.add_argument(
-        "--frame", help="the second frame, as 'run' names it", **COUNT
-    )
-    add("--out", default="pair.png", metavar="FILE", help="default: %(default)s")
-    add(
-        "--method",
-        default="hybrid",
-        metavar="NAME",
-        help="estimator (default: hybrid)",
-    )
-    _add_flow(command, "auto")
-    add(
+    ),
+    JOBS,
+    CLUSTER,
+)
+SHOW = command(
+    "show",
+    "Draw the maps of one pair of a sequence.",
+    calling("hybridvo.run.commands.show:draw_pair"),
+    *sequence(),
+    WEIGHTS,
+    Either(
+        (
+            count("--pair N", "first frame (default 0)", default=0),
+            word(
+                "--frame N",
+                "the second frame, as 'run' names it",
+                dest="pair",
+                type=frame_before,
+            ),
+        )
+    ),
+    word("--out FILE", "default: %(default)s", default="pair.png"),
+    word("--method NAME", "estimator (default: hybrid)", default="hybrid"),
+    FLOW,
+    switch(
         "--all",
+        "also the other image, the ego flow and its error, and what PWVO looks at: slow",
         dest="everything",
-        help="also the other image, the ego flow and its error, and what PWVO looks at: slow",
-        **FLAG,
-    )
-    add("--overwrite", help="replace the image", **FLAG)
-
-
-def _add_doctor(commands: Any) -> None:
-    about = "What is missing here, or wrong with a sequence or a live camera."
-    command = _command(commands, "doctor", about, dispatch.doctor)
-    what = "of DIR; without DIR a live camera, as for 'live'"
-    _add_sequence(command, required=False, camera=f"{CAMERA_HELP}: {what}")
-    add = command.add_argument
-    add("--pairs", default=40, help="pairs (default 40)", **COUNT)
-    add(
-        "--speed",
-        help="how fast DIR, or the demo, is tracked here, and what a frame's time goes to",
-        **FLAG,
-    )
-    add("--preset", metavar="NAME|FILE", help="settings of a live camera, as d435")
-    add(
-        "--seconds",
-        type=float,
-        default=DOCTOR_SECONDS,
-        metavar="S",
-        help="of a live camera (default %(default)s)",
-    )
-
-
-def _add_topics(commands: Any) -> None:
-    about = "List the topics of a bag, and which of them are taken."
-    command = _command(commands, "topics", about, dispatch.topics)
-    command.add_argument(
-        "file", metavar="FILE", help="a bag of ROS 1, or file or folder of ROS 2"
-    )
-    _add_trust(command)
-
-
-# -- other commands ----------------------------------------------------------------------
-
-
-def _add_evaluate(commands: Any) -> None:
-    about = "Errors of a trajectory against the ground truth."
-    command = _command(commands, "evaluate", about, dispatch.evaluate)
-    add = command.add_argument
-    add("estimate", metavar="EST", help="estimated trajectory")
-    add("gt", metavar="GT", help="true trajectory (with --protocol also: DIR)")
-    add("--alignment", choices=ALIGNMENTS, default="se3", help="of the ATE")
-    add(
-        "--delta",
-        type=float,
-        default=1,
-        metavar="X",
-        help="span of the RPE (default 1)",
-    )
-    add(
+    ),
+    switch("--overwrite", "replace the image"),
+    flow="auto",
+)
+EVALUATE = command(
+    "evaluate",
+    "Errors of a trajectory against the ground truth.",
+    dispatch.evaluate,
+    word("estimate EST", "estimated trajectory"),
+    word("gt GT", "true trajectory (with --protocol also: DIR)"),
+    word("--alignment", "of the ATE", choices=ALIGNMENTS, default="se3"),
+    number("--delta X", "span of the RPE (default 1)", default=1),
+    word(
         "--delta-unit",
+        "unit of --delta",
         choices=("frames", "s"),
         default="frames",
-        help="unit of --delta",
-    )
-    add(
-        "--max-diff",
-        type=float,
+    ),
+    number(
+        "--max-diff S",
+        "seconds between matches (default %(default)s)",
         default=MAX_STAMP_DIFFERENCE_S,
-        metavar="S",
-        help="seconds between matches (default %(default)s)",
-    )
-    add(
+    ),
+    word(
         "--protocol",
+        "errors as papers define them; GT is a sequence, or its file as published",
         choices=[name for name in PROTOCOLS if name != "paper"],
-        help="errors as papers define them; GT is a sequence, or its file as published",
-    )
-
-
-def _add_convert(commands: Any) -> None:
-    about = "Write a sequence as a plain folder, in TUM's layout, or as a bag."
-    command = _command(commands, "convert", about, dispatch.convert)
-    _add_sequence(command)
-    add = command.add_argument
-    add("out", metavar="OUT", help="new folder, or file that ends in .bag")
-    add(
+    ),
+)
+DOCTOR = command(
+    "doctor",
+    "What is missing here, or wrong with a sequence or a live camera.",
+    dispatch.doctor,
+    *sequence(
+        required=False,
+        camera=f"{CAMERA_HELP}: of DIR; without DIR a live camera, as for 'live'",
+    ),
+    count("--pairs N", "pairs (default 40)", default=40),
+    switch(
+        "--speed",
+        "how fast DIR, or the demo, is tracked here, and what a frame's time goes to",
+    ),
+    word("--preset NAME|FILE", "settings of a live camera, as d435"),
+    number(
+        "--seconds S",
+        "of a live camera (default %(default)s)",
+        default=DOCTOR_SECONDS,
+    ),
+)
+TOPICS = command(
+    "topics",
+    "List the topics of a bag, and which of them are taken.",
+    calling("hybridvo.run.commands.diagnosis.topics:topics"),
+    word("file FILE", "a bag of ROS 1, or file or folder of ROS 2"),
+    TRUST,
+)
+CONVERT = command(
+    "convert",
+    "Write a sequence as a plain folder, in TUM's layout, or as a bag.",
+    calling("hybridvo.run.commands.convert:convert"),
+    *sequence(),
+    word("out OUT", "new folder, or file that ends in .bag"),
+    word(
         "--to",
+        "layout (default: ros1 for a .bag, else folder)",
         choices=("folder", "tum", "ros1", "ros2"),
-        help="layout (default: ros1 for a .bag, else folder)",
-    )
-    add(
-        "--units",
-        type=float,
-        metavar="N",
-        help="of written depth in a metre (default 1000; tum 5000; bags: 1000 or 1)",
-    )
-    add("--start", default=0, help="first frame (default 0)", **COUNT)
-    add("--stop", help="the one after the last frame", **COUNT)
-    add("--stride", default=1, help="step between frames (default 1)", **COUNT)
-
-
-def _add_demo(commands: Any) -> None:
-    about = "Render a scene with moving objects and run on it."
-    command = _command(commands, "demo", about, dispatch.demo)
-    add = command.add_argument
-    add("--out", default="runs/demo", metavar="DIR", help="default: %(default)s")
-    add("--overwrite", help="replace the results in --out", **FLAG)
-    add("--frames", default=20, help="default: 20", **COUNT)
-    add("--seed", default=0, help="of the scene", **COUNT)
-
-
-def _add_generate(commands: Any) -> None:
-    about = "Draw training samples into a folder."
-    command = _command(commands, "generate", about, dispatch.generate)
-    add = command.add_argument
-    add(
+    ),
+    number(
+        "--units N",
+        "of written depth in a metre (default 1000; tum 5000; bags: 1000 or 1)",
+    ),
+    *FRAMES,
+    start=0,
+    stride=1,
+)
+DEMO = command(
+    "demo",
+    "Render a scene with moving objects and run on it.",
+    calling("hybridvo.run.commands.demo:demo"),
+    word("--out DIR", "default: %(default)s", default="runs/demo"),
+    OVERWRITE,
+    count("--frames N", "default: 20", default=20),
+    count("--seed N", "of the scene", default=0),
+)
+GENERATE = command(
+    "generate",
+    "Draw training samples into a folder.",
+    calling("hybridvo.run.commands.train:generate"),
+    word(
         "--preset",
+        "paper, diverse or a YAML file; default: %(default)s",
         default="paper",
-        help="paper, diverse or a YAML file; default: %(default)s",
-    )
-    add("--out", required=True, metavar="DIR", help="folder of the samples")
-    add("--count", default=1000, help="default: 1000", **COUNT)
-    add("--seed", default=0, **COUNT)
-    add("--size", type=int, nargs=2, metavar=("H", "W"), help="pixels")
-    _add_workers(command, "--workers")
-
-
-def _add_init(commands: Any) -> None:
-    about = "Write a camera.yaml to fill in."
-    command = _command(commands, "init", about, dispatch.init)
-    command.add_argument(
-        "directory", metavar="DIR", help="folder with rgb/ and depth/"
-    )
-
-
-def _add_train(commands: Any) -> None:
-    """Add ``train`` with its own commands."""
-    about = "Train a network; started again with the same --out it goes on where it was."
-    train = commands.add_parser(
-        "train", help=about, description=f"{about} See docs/training.md."
-    )
-    tasks = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
-
-    about = "train PWVO"
-    command = _command(tasks, "pwvo", about, dispatch.train)
-    _add_training(command)
-    add = command.add_argument
-    add("--config", type=Path, default=Path("configs/train_pwvo.yaml"))
-    add("--data", type=Path, required=True, help="folder of the shards")
-    command.set_defaults(workers=0, device="cpu")
-
-    about = "train a network of the paper"
-    command = _command(tasks, "paper", about, dispatch.train)
-    _add_training(command)
-    add = command.add_argument
-    add("--config", type=Path, required=True, help="configs/train_*.yaml")
-    add("--workers", type=int, default=0, help="processes that draw samples")
-    add("--device", choices=DEVICES, default="auto")
-    command.set_defaults(data=Path())
-
-    about = "write a network's weights for users (int8)"
-    command = _command(tasks, "export", about, dispatch.export_weights)
-    add = command.add_argument
-    add("--out", dest="folder", type=Path, required=True, help="folder of the run")
-    add(
-        "--export",
-        dest="path",
+    ),
+    word("--out DIR", "folder of the samples", required=True),
+    count("--count N", "default: 1000", default=1000),
+    count("--seed N", default=0),
+    count("--size", "pixels", nargs=2, metavar=("H", "W")),
+    JOBS._replace(names=("--jobs", "--workers")),
+    CLUSTER,
+)
+INIT = command(
+    "init",
+    "Write a camera.yaml to fill in.",
+    calling("hybridvo.io.data.camera_file:write_camera_template"),
+    word("directory DIR", "folder with rgb/ and depth/"),
+)
+TRAIN_PWVO = command(
+    "pwvo",
+    "train PWVO",
+    dispatch.train,
+    *TRAINING,
+    word("--config", type=Path, default=Path("configs/train_pwvo.yaml")),
+    SHARDS,
+)
+TRAIN_PAPER = command(
+    "paper",
+    "train a network of the paper",
+    dispatch.train,
+    *TRAINING,
+    word("--config", "configs/train_*.yaml", type=Path, required=True),
+    count("--workers", "processes that draw samples", default=0),
+    word("--device", choices=DEVICES, default="auto"),
+)
+TRAIN_EXPORT = command(
+    "export",
+    "write a network's weights for users (int8)",
+    calling("hybridvo.lab.training.trainer:export_run"),
+    word("--out", "folder of the run", dest="folder", type=Path, required=True),
+    word("--export FILE", "*.safetensors", dest="path", type=Path, required=True),
+    count("--count", "held-out pairs of each preset", default=1000),
+)
+TRAIN_SAMPLES = command(
+    "samples",
+    "draw samples for PWVO",
+    calling("hybridvo.run.commands.train:draw_training_samples"),
+    SHARDS,
+    count("--first-seed", "below 1000: held out", default=1000000),
+    count("--seeds", "about as many samples", default=0),
+    word(
+        "--recordings DIR",
+        "folder of recordings, from which most of the pairs are made then",
         type=Path,
-        required=True,
-        metavar="FILE",
-        help="*.safetensors",
-    )
-    add("--count", type=int, default=1000, help="held-out pairs of each preset")
-
-    about = "draw samples for PWVO"
-    command = _command(tasks, "samples", about, dispatch.draw_training_samples)
-    add = command.add_argument
-    add("--data", type=Path, required=True, help="folder of the shards")
-    add("--first-seed", type=int, default=1000000, help="below 1000: held out")
-    add("--seeds", type=int, default=0, help="about as many samples")
-    add(
-        "--recordings",
-        type=Path,
-        metavar="DIR",
-        help="folder of recordings, from which most of the pairs are made then",
-    )
-    add(
-        "--shares",
-        type=float,
+    ),
+    number(
+        "--shares SHARE",
+        "of tripod recordings, semi-real pairs, objects of a kind in these, and pairs with "
+        "exchanged roles",
         nargs="+",
         default=(),
-        metavar="SHARE",
-        help="of tripod recordings, semi-real pairs, and objects of a kind in these",
+    ),
+    JOBS,
+    CLUSTER,
+)
+COMMANDS = (
+    *(RUN, LIVE, COMPARE, SHOW, EVALUATE, DOCTOR, TOPICS, CONVERT, DEMO, GENERATE),
+    INIT,
+)
+TRAINING_COMMANDS = (TRAIN_PWVO, TRAIN_PAPER, TRAIN_EXPORT, TRAIN_SAMPLES)
+"""The commands of ``train``."""
+TRAIN = (
+    "Train a network; started again with the same --out it goes on where it was."
+)
+"""What ``train`` does, for ``--help``."""
+
+
+def build_parser() -> ArgumentParser:
+    """Make the parser of the command line.
+
+    The parsed arguments have the function to call in ``call``.
+    """
+    about = "Metric camera motion with covariance from optical flow, depth and intrinsics."
+    parser = Parser(prog="hybridvo", description=about)
+    parser.add_argument(
+        "--version", action="version", version=f"hybridvo {__version__}"
     )
-    _add_workers(command)
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="COMMAND"
+    )
+    for command in COMMANDS:
+        _add(commands, command)
+    train = commands.add_parser(
+        "train", help=TRAIN, description=f"{TRAIN} See docs/training.md."
+    )
+    tasks = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
+    for command in TRAINING_COMMANDS:
+        _add(tasks, command)
+    return parser
+
+
+def _add(commands: Any, command: Command) -> None:
+    """Add the parser of a command to those of the others."""
+    parser = commands.add_parser(
+        command.name, help=command.about, description=command.about
+    )
+    for argument in (*LOUDNESS, *command.arguments):
+        if isinstance(argument, Argument):
+            parser.add_argument(*argument.names, **argument.settings)
+            continue
+        group = parser.add_mutually_exclusive_group(required=argument.required)
+        for names, settings in argument.arguments:
+            group.add_argument(*names, **settings)
+    parser.set_defaults(call=command.call, **command.defaults)

@@ -129,11 +129,7 @@ def compare(
     *,
     methods: Iterable[str] = ("all",),
     options: Options | None = None,
-    dataset: str | None = None,
-    camera: str | None = None,
-    depth_scale: float | None = None,
-    mask: str | None = None,
-    chosen: Mapping[str, Any] | None = None,
+    opened_with: Mapping[str, Any] | None = None,
     protocol: str | None = None,
     models: Models | None = None,
     mode: Mode = "new",
@@ -148,11 +144,7 @@ def compare(
         out: The output folder.
         methods: Names of methods; ``all`` stands for every method that can run here.
         options: The options of all runs.
-        dataset: As in ``open_sequence``, for all sequences.
-        camera: Likewise.
-        depth_scale: Likewise.
-        mask: Likewise.
-        chosen: Its keyword arguments, such as the topics of a bag, likewise.
+        opened_with: Keyword arguments of ``open_sequence``, such as ``camera``, for all sequences.
         protocol: One of ``protocols.yaml``: it chooses sequences and frames, and scores them
             as ``docs/protocols.md`` states.
         models: The networks; by default the pretrained ones.
@@ -170,23 +162,19 @@ def compare(
     """
     workers = workers or Workers()
     out = Path(out)
+    reading = dict(opened_with or {})
     if workers.are_remote:
         # workers are in other folders
         out = out.absolute()
-        mask = _absolute(mask)
-        camera = _absolute(camera)
-        chosen = {name: _absolute(value) for name, value in (chosen or {}).items()}
+        reading |= {
+            name: _absolute(value)
+            for name, value in reading.items()
+            if name != "dataset"
+        }
     options = options or Options()
     models = models or Models(options.run.device)
     names, missing = methods_to_run(methods, models)
-    open_one = partial(
-        open_sequence,
-        dataset=dataset,
-        camera=camera,
-        depth_scale=depth_scale,
-        mask=mask,
-        **(chosen or {}),
-    )
+    open_one = partial(open_sequence, **reading)
     rules = None if protocol is None else protocols.check_protocol(protocol)
     if rules is not None:
         _check_frames_are_free(rules, options)

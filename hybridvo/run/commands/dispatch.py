@@ -1,16 +1,20 @@
-"""The way from the command line to the code: one function for each command.
+"""The way from the command line to the code: arguments are passed by name.
 
-:mod:`hybridvo.run.commands.arguments` names one of these functions for every command. It takes the
-parsed arguments, calls the function that does the work, and returns what is printed. Heavy
-modules are imported inside of the functions, so that ``--help`` is instant, and after all that can
-be checked without them, so that a typo is answered at once.
+:mod:`hybridvo.run.commands.arguments` states which function a command calls. The function gets the
+arguments that have the names of its parameters, and what :func:`prepared` makes of others. Heavy
+modules are imported inside of functions, so that ``--help`` is instant, and after all that can be
+checked without them, so that a typo is answered at once.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import os
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,16 +27,11 @@ from hybridvo.run.commands.early import (
 from hybridvo.run.commands.next_step import command_that_shows
 
 if TYPE_CHECKING:
-    from hybridvo.core.cluster import Workers
     from hybridvo.core.options import Options
-    from hybridvo.io.data.sequence import Sequence as FrameSequence
     from hybridvo.network.models import Models
 
-CHOICES = (
-    *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
-    *("depth_dir", "stereo", "readout_ms", "depth_lag_ms", "fps", "trust"),
-)
-"""What only some recordings need: further arguments of ``open_sequence``."""
+OUTPUTS = ("out", "estimate", "gt", "directory")
+"""Arguments that name files or folders which need not be there."""
 SCENE_FOLDERS = (
     "final",
     "clean",
@@ -53,29 +52,47 @@ class Outcome(NamedTuple):
     exit_code: int = 0
 
 
+def calling(place: str) -> Callable[[Namespace], Outcome]:
+    """Return a command that calls a function, which returns a report or the file it wrote.
+
+    Args:
+        place: ``MODULE:FUNCTION``.
+    """
+    return partial(_call_place, place)
+
+
+def _call_place(place: str, args: Namespace) -> Outcome:
+    """Call ``MODULE:FUNCTION`` with the arguments that it takes."""
+    given = prepared(args)
+    module, _, name = place.partition(":")
+    result = call(getattr(import_module(module), name), given)
+    if isinstance(result, Path):
+        result = {"files": [str(result)]}
+    return Outcome(result)
+
+
+def taken_by(
+    function: Callable[..., Any], given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the arguments that have the names of a function's parameters."""
+    names = inspect.signature(function).parameters
+    return {name: value for name, value in given.items() if name in names}
+
+
+def call(function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
+    """Call a function with those of the arguments that it takes."""
+    return function(**taken_by(function, given))
+
+
+# -- commands that are more than a call --------------------------------------------------
+
+
 def run(args: Namespace) -> Outcome:
-    """``hybridvo run``: track a sequence."""
-    _check_sequence(args.sequence, args.trust)
-    _check_output(args.out)
-    check_view(args.view)
-    options = _options(args)
-    check_methods([options.run.method])
-    models = _models(args.weights, options.run.device)
-    sequence = _open(args, options)
+    """``hybridvo run``: track a sequence, and name the command that shows its least sure step."""
+    given = prepared(args)
     from hybridvo.run.commands.run import run
 
-    summary, exit_code = run(
-        sequence,
-        args.out,
-        options,
-        models=models,
-        mode=args.mode,
-        command=args.words,
-        quiet=args.quiet,
-        rrd=args.rrd,
-        view=args.view,
-        export=tuple(args.export),
-    )
+    summary, exit_code = call(run, given)
     worst = summary.get("least_sure")
     if worst is not None:
         summary["next"] = command_that_shows(args, worst["frame"])
@@ -84,295 +101,117 @@ def run(args: Namespace) -> Outcome:
 
 def live(args: Namespace) -> Outcome:
     """``hybridvo live``: track a camera."""
-    _check_output(args.out)
     check_camera(args.camera, args.preset)
-    check_view(args.view)
-    options = _options(args)
-    check_methods([options.run.method])
-    models = _models(args.weights, options.run.device)
+    given = prepared(args)
     from hybridvo.io.cameras.choose import choose_camera
 
-    camera = choose_camera(
-        args.camera,
-        args.preset,
-        options.depth.source,
-        args.mask,
-        args.readout_ms,
-        args.trust,
-        depth_lag_ms=args.depth_lag_ms,
-        imu=args.imu,
-    )
+    source = given["options"].depth.source
+    camera = call(choose_camera, given | {"name": args.camera, "depth": source})
     from hybridvo.run.commands.live import live
 
-    summary, exit_code = live(
-        camera,
-        args.out,
-        options,
-        models=models,
-        seconds=args.seconds,
-        max_frames=args.max_frames,
-        udp=args.udp,
-        rrd=args.rrd,
-        view=args.view,
-        size=args.size,
-        rate=args.rate,
-        overwrite=args.overwrite,
-        command=args.words,
-        quiet=args.quiet,
-    )
-    return Outcome(summary, exit_code)
-
-
-def compare(args: Namespace) -> Outcome:
-    """``hybridvo compare``: run methods side by side."""
-    for sequence in args.sequences:
-        _check_sequence(sequence, args.trust)
-    _check_output(args.out)
-    check_methods([args.methods] if isinstance(args.methods, str) else args.methods)
-    options = _options(args)
-    models = _models(args.weights, options.run.device)
-    from hybridvo.run.commands.compare import compare
-
-    summary = compare(
-        args.sequences,
-        args.out,
-        methods=args.methods,
-        options=options,
-        dataset=args.dataset,
-        camera=args.camera,
-        depth_scale=args.depth_scale,
-        mask=args.mask,
-        chosen={**_chosen(args), "depth": _network_depth(options)},
-        protocol=args.protocol,
-        models=models,
-        mode=args.mode,
-        command=args.words,
-        quiet=args.quiet,
-        workers=_workers(args),
-    )
-    return Outcome(summary)
-
-
-def show(args: Namespace) -> Outcome:
-    """``hybridvo show``: draw the maps of one pair."""
-    _check_sequence(args.sequence, args.trust)
-    _check_output(args.out)
-    check_methods([args.method])
-    models = _models(args.weights, "cpu")
-    sequence = _open(args)
-    from hybridvo.run.commands.show import draw_pair
-
-    picture = draw_pair(
-        sequence,
-        args.pair if args.frame is None else args.frame - 1,
-        args.out,
-        flow=args.flow,
-        method=args.method,
-        models=models,
-        everything=args.everything,
-        overwrite=args.overwrite,
-    )
-    return _written(picture)
-
-
-def convert(args: Namespace) -> Outcome:
-    """``hybridvo convert``: write a sequence in another layout."""
-    _check_sequence(args.sequence, args.trust)
-    _check_output(args.out)
-    sequence = _open(args)
-    from hybridvo.run.commands.convert import convert as write
-
-    summary = write(
-        sequence,
-        args.out,
-        args.to,
-        args.units,
-        args.start,
-        args.stop,
-        args.stride,
-        quiet=args.quiet,
-    )
-    return Outcome(summary)
+    return Outcome(*call(live, given | {"camera": camera}))
 
 
 def evaluate(args: Namespace) -> Outcome:
     """``hybridvo evaluate``: compute the errors of a trajectory."""
-    _check_output(args.estimate)
-    _check_output(args.gt)
-    if args.protocol is not None:
-        return _evaluate_by_protocol(args)
+    given = prepared(args)
     from hybridvo.core.errors import InputError
-    from hybridvo.lab.evaluation.metrics import evaluate
 
-    report = evaluate(
-        args.estimate,
-        args.gt,
-        alignment=args.alignment,
-        delta=args.delta,
-        delta_unit=args.delta_unit,
-        max_diff=args.max_diff,
-    )
+    if args.protocol is None:
+        from hybridvo.lab.evaluation.metrics import evaluate
+
+        report = call(evaluate, given)
+        reasons = [report["reasons"].get("ate_rmse_unaligned")]
+    else:
+        from hybridvo.lab.evaluation.path_scores import evaluate_path
+
+        report = call(evaluate_path, given)
+        reasons = list(dict.fromkeys(report["reasons"].values()))
     if report["matched"] == 0:
-        reason = report["reasons"]["ate_rmse_unaligned"]
-        raise InputError(f"nothing could be compared: {reason}.")
-    return Outcome(report)
-
-
-def _evaluate_by_protocol(args: Namespace) -> Outcome:
-    """``hybridvo evaluate --protocol``: the errors of one path as papers define them."""
-    from hybridvo.core.errors import InputError
-    from hybridvo.lab.evaluation.path_scores import evaluate_path
-
-    report = evaluate_path(args.protocol, args.estimate, args.gt)
-    if report["matched"] == 0:
-        reason = "; ".join(dict.fromkeys(report["reasons"].values()))
-        raise InputError(f"nothing could be compared: {reason}.")
+        raise InputError(f"nothing could be compared: {'; '.join(reasons)}.")
     return Outcome(report)
 
 
 def doctor(args: Namespace) -> Outcome:
     """``hybridvo doctor``: check what is installed, a sequence, or a camera."""
-    _check_sequence(args.sequence, args.trust)
-    if args.speed:
-        return _doctor_speed(args)
-    if args.sequence is not None:
-        sequence = _open(args)
-    elif args.camera is not None or args.preset is not None:
+    from hybridvo.core.errors import InputError
+
+    names_camera = args.camera is not None or args.preset is not None
+    is_live = names_camera and args.sequence is None
+    if args.speed and is_live:
+        raise InputError(
+            "--speed: expected DIR, or nothing for the demo, got a live camera; "
+            "'hybridvo live --rate auto' measures at the camera."
+        )
+    if is_live:
         check_camera(args.camera, args.preset)
+    given = prepared(args)
+    if args.speed:
+        from hybridvo.run.commands.diagnosis.speed import speed
+
+        return Outcome(call(speed, given))
     from hybridvo.run.commands.doctor import diagnose, diagnose_camera, installation
 
-    if args.sequence is not None:
-        report = diagnose(sequence, args.pairs)
-    elif args.camera is not None or args.preset is not None:
-        report = diagnose_camera(
-            args.camera,
-            args.preset,
-            args.seconds,
-            args.pairs,
-            readout_ms=args.readout_ms,
-            depth_lag_ms=args.depth_lag_ms,
-            trust=args.trust,
-            quiet=args.quiet,
-        )
+    if is_live:
+        report = call(diagnose_camera, given | {"name": args.camera})
+    elif args.sequence is not None:
+        report = call(diagnose, given)
     else:
         return Outcome(installation())
     return Outcome(report, 0 if report["ok"] else 1)
 
 
-def _doctor_speed(args: Namespace) -> Outcome:
-    """``hybridvo doctor --speed``: how fast a sequence, or the demo, is tracked."""
-    from hybridvo.core.errors import InputError
-
-    is_live = args.camera is not None or args.preset is not None
-    if args.sequence is None and is_live:
-        raise InputError(
-            "--speed: expected DIR, or nothing for the demo, got a live camera; "
-            "'hybridvo live --rate auto' measures at the camera."
-        )
-    sequence = None if args.sequence is None else _open(args)
-    from hybridvo.run.commands.diagnosis.speed import speed
-
-    return Outcome(speed(sequence))
-
-
-def topics(args: Namespace) -> Outcome:
-    """``hybridvo topics``: list the topics of a bag."""
-    _check_sequence(args.file, args.trust)
-    from hybridvo.run.commands.diagnosis.topics import topics
-
-    return Outcome(topics(args.file, args.trust))
-
-
-def demo(args: Namespace) -> Outcome:
-    """``hybridvo demo``: render a scene and compare methods on it."""
-    _check_output(args.out)
-    from hybridvo.run.commands.demo import demo
-
-    summary = demo(
-        args.out,
-        frames=args.frames,
-        seed=args.seed,
-        overwrite=args.overwrite,
-        command=args.words,
-        quiet=args.quiet,
-    )
-    return Outcome(summary)
-
-
-def generate(args: Namespace) -> Outcome:
-    """``hybridvo generate``: draw training samples."""
-    _check_output(args.out)
-    from hybridvo.run.commands.train import generate
-
-    sheet = generate(
-        args.preset,
-        args.count,
-        args.out,
-        seed=args.seed,
-        size=args.size,
-        workers=_workers(args),
-        quiet=args.quiet,
-    )
-    return _written(sheet)
-
-
-def init(args: Namespace) -> Outcome:
-    """``hybridvo init``: write a camera.yaml to fill in."""
-    _check_output(args.directory)
-    from hybridvo.io.data.camera_file import write_camera_template
-
-    return _written(write_camera_template(args.directory))
-
-
 def train(args: Namespace) -> Outcome:
     """``hybridvo train pwvo`` and ``train paper``: train a network."""
-    _check_output(args.out)
     check_config(args.config)
+    given = prepared(args)
     from hybridvo.run.commands.train import train_network
 
-    result = train_network(
-        args.training,
-        args.config,
-        args.out,
-        data=args.data,
-        init=args.init,
-        time_limit=args.time_limit,
-        seed=args.seed,
-        device=args.device,
-        workers=args.workers,
-        command=args.words,
-    )
-    return Outcome(result)
-
-
-def export_weights(args: Namespace) -> Outcome:
-    """``hybridvo train export``: write the weights of a training run for users."""
-    from hybridvo.lab.training.trainer import export_run
-
-    return Outcome(export_run(args.folder, args.path, args.count))
-
-
-def draw_training_samples(args: Namespace) -> Outcome:
-    """``hybridvo train samples``: draw samples for PWVO."""
-    from hybridvo.run.commands.train import draw_training_samples
-
-    result = draw_training_samples(
-        args.data,
-        args.first_seed,
-        args.seeds,
-        recordings=args.recordings,
-        shares=args.shares,
-        workers=_workers(args),
-    )
-    return Outcome(result)
+    return Outcome(call(train_network, given))
 
 
 # -- what commands share -----------------------------------------------------------------
 
 
-def _written(path: Path) -> Outcome:
-    """Return the outcome of a command that has written one file."""
-    return Outcome({"files": [str(path)]})
+def prepared(args: Namespace) -> dict[str, Any]:
+    """Check the arguments of a command, and return them with what is made of them.
+
+    Returns:
+        The arguments by name, and for commands that have arguments for these: ``options``,
+        ``models``, ``workers``, ``opened_with`` (how sequences are read), ``sequence``, which is
+        open then, and ``command``, the words of the command line.
+    """
+    given = vars(args) | {"command": args.words}
+    sequence = given.get("sequence", given.get("file"))
+    for path in given.get("sequences", [sequence]):
+        _check_sequence(path, given.get("trust", False))
+    for name in OUTPUTS:
+        _check_output(given.get(name))
+    check_view(given.get("view"))
+    options = None
+    if "assignments" in args:
+        options = given["options"] = _options(given)
+    if "method" in args:
+        check_methods([options.run.method if options else args.method])
+    check_methods(given.get("methods", ()))
+    if "weights" in args:
+        device = options.run.device if options else "cpu"
+        given["models"] = _models(args.weights, device)
+    if "jobs" in args:
+        from hybridvo.core.cluster import Workers
+
+        given["workers"] = Workers(args.jobs, args.cluster)
+    if "dataset" in args:
+        from hybridvo.io.data.open import open_sequence
+
+        reading = taken_by(open_sequence, given)
+        if options is not None:
+            source = options.depth.source
+            reading["depth"] = None if source == "auto" else source
+        given["opened_with"] = reading
+        if sequence is not None:
+            given["sequence"] = open_sequence(args.sequence, **reading)
+    return given
 
 
 def _check_output(path: str | Path | None) -> None:
@@ -402,62 +241,19 @@ def _check_sequence(path: str | None, trust: bool = False) -> None:
         raise InputError(missing_sequence(path))
 
 
-def _open(args: Namespace, options: Options | None = None) -> FrameSequence:
-    """Open the sequence that the arguments name, with the depth that the options select."""
-    from hybridvo.io.data.open import open_sequence
+def _options(given: Mapping[str, Any]) -> Options:
+    """Read the options: arguments of their own win over ``--set``, which wins over the file.
 
-    depth = args.depth if options is None else _network_depth(options)
-    return open_sequence(
-        args.sequence,
-        dataset=args.dataset,
-        camera=args.camera,
-        depth_scale=args.depth_scale,
-        mask=args.mask,
-        depth=depth,
-        **_chosen(args),
-    )
+    An argument with the name of an option of the group ``run`` sets that option.
+    """
+    from hybridvo.core.options import RunOptions, load_options
 
-
-def _network_depth(options: Options) -> str | None:
-    """Return the network that predicts depth; None: the sequence has its own."""
-    source = options.depth.source
-    return None if source == "auto" else source
-
-
-def _chosen(args: Namespace) -> dict[str, Any]:
-    """Return what only some recordings need: topics of a bag, the depth of a video."""
-    return {name: getattr(args, name) for name in CHOICES}
-
-
-def _workers(args: Namespace) -> Workers:
-    """Return where independent tasks run."""
-    from hybridvo.core.cluster import Workers
-
-    return Workers(args.jobs, args.cluster)
-
-
-def _options(args: Namespace) -> Options:
-    """Read the options: arguments of their own win over ``--set``, which wins over the file."""
-    from hybridvo.core.options import load_options
-
-    own_arguments = {
-        "flow.source": args.flow,
-        "depth.source": args.depth,
-        "run.start": args.start,
-        "run.stop": args.stop,
-        "run.stride": args.stride,
-        "run.seed": args.seed,
-        "run.device": args.device,
+    named = {
+        f"run.{option.name}": given.get(option.name)
+        for option in dataclasses.fields(RunOptions)
     }
-    if args.command in ("run", "live"):
-        own_arguments |= {
-            "run.method": args.method,
-            "run.max_failed": args.max_failed,
-            "run.strict": args.strict,
-        }
-    if args.command == "run":
-        own_arguments["run.passes"] = args.passes
-    return load_options(args.config, args.assignments, own_arguments)
+    named |= {"flow.source": given["flow"], "depth.source": given["depth"]}
+    return load_options(given["config"], given["assignments"], named)
 
 
 def _models(weights: Sequence[str], device: str) -> Models:

@@ -2,31 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
 from argparse import Namespace
 from typing import Any
-
-READING = (
-    *(
-        "dataset",
-        "camera",
-        "depth_scale",
-        "readout_ms",
-        "depth_lag_ms",
-        "mask",
-        "depth",
-    ),
-    *(
-        "topic_rgb",
-        "topic_depth",
-        "topic_info",
-        "topic_truth",
-        "depth_dir",
-        "stereo",
-    ),
-    *("trust", "flow", "method"),
-)
-"""Arguments of ``run`` that ``show`` takes too."""
 
 
 def command_that_shows(args: Namespace, frame: int) -> str:
@@ -40,8 +19,11 @@ def command_that_shows(args: Namespace, frame: int) -> str:
         >>> command_that_shows(Namespace(sequence="my walk", flow="dis", trust=True), 7)
         "hybridvo show 'my walk' --trust --flow dis --frame 7"
     """
+    from hybridvo.io.data.open import open_sequence
+
+    reading = inspect.signature(open_sequence).parameters
     words = ["hybridvo", "show", str(args.sequence)]
-    for name in READING:
+    for name in (*reading, "flow", "method"):
         words += _option(name, getattr(args, name, None))
     for weights in getattr(args, "weights", []):
         words += ["--weights", weights]

@@ -35,11 +35,11 @@ ROLES = {
 """For what a topic is taken, by the name of the field."""
 
 
-def topics(path: str | Path, trust: bool = False) -> dict[str, Any]:
+def topics(file: str | Path, trust: bool = False) -> dict[str, Any]:
     """List the topics of a bag.
 
     Args:
-        path: The file, or the folder of ROS 2.
+        file: The file, or the folder of ROS 2.
         trust: Whether it is read without limits, as in ``open_sequence``.
 
     Returns:
@@ -51,7 +51,7 @@ def topics(path: str | Path, trust: bool = False) -> dict[str, Any]:
     Raises:
         InputError: It is no bag, or nothing of it can be read.
     """
-    path = Path(path)
+    path = Path(file)
     if not BagSequence.knows(path):
         got = "something else" if path.exists() else "no such file"
         raise InputError(f"{path}: expected a bag of ROS 1 or ROS 2, got {got}.")
