@@ -32,7 +32,7 @@ from hybridvo.core.files import (
     write_json,
 )
 from hybridvo.core.options import Options
-from hybridvo.core.trajectory import Trajectory, read_trajectory
+from hybridvo.core.trajectory import read_trajectory
 from hybridvo.io.data.open import open_sequence
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.lab.evaluation import protocols, scores
@@ -115,14 +115,6 @@ class _Scored:
     protocol_rows: list[dict[str, Any]]
 
 
-class _Opened(NamedTuple):
-    """The sequences of a comparison."""
-
-    sequences: list[Sequence]
-    # names of those in the folders that are not of the protocol
-    left_out: list[str]
-
-
 def compare(
     sequences: Iterable[str | Path],
     out: str | Path,
@@ -197,7 +189,6 @@ def compare(
         if mode == "overwrite":
             _remove_runs(out)
         _warn_of(missing)
-        _warn_without_path_errors()
         scored = _run_and_score(comparison, opened.sequences, open_one, quiet)
         pairs = pd.concat([part.pairs for part in scored], ignore_index=True)
         result = _result(comparison, scored, pairs)
@@ -215,15 +206,10 @@ def compare(
 
 
 def _warn_of(missing: Mapping[str, str]) -> None:
-    """Log which methods do not run, and why."""
+    """Log which methods do not run, and why tables have no errors of paths, if they have none."""
     for reason in reasons_of(missing):
         _logger.warning("not run: %s", reason)
-
-
-def _warn_without_path_errors() -> None:
-    """Log why the tables have no errors of paths, where the library for these is missing."""
-    reason = missing_library()
-    if reason:
+    if reason := missing_library():
         _logger.warning("no errors of paths (ATE, RPE): %s", reason)
 
 
@@ -359,7 +345,7 @@ def _open_each(
     options: Options,
     open_one: Opener,
     protocol: Protocol | None,
-) -> _Opened:
+) -> protocols.Chosen:
     """Open all sequences, give each a name of its own, and refuse at once what cannot be run."""
     opened: list[Sequence] = []
     left_out: list[str] = []
@@ -381,7 +367,7 @@ def _open_each(
         raise InputError(
             "compare: expected at least one folder of a sequence, got none."
         )
-    return _Opened(opened, left_out)
+    return protocols.Chosen(opened, left_out)
 
 
 def _of_protocol(
@@ -559,7 +545,8 @@ def _score(comparison: _Comparison, task: _Scoring) -> _Scored:
     truth_file = None
     if truth is not None:
         truth_file = f"{folder}/ground_truth.tum"
-        _save(truth, out / truth_file)
+        make_folder(out / folder)
+        truth.save(out / truth_file)
     inputs = {"flow_source": flow_source, "depth_source": sequence.depth_source}
     rows = []
     protocol_rows = []
@@ -599,12 +586,6 @@ def _given(depth_source: str, line: Mapping[str, Any]) -> str:
     if line["method"] not in baselines.WITHOUT_FLOW:
         inputs.append(f"{line['flow_source']} flow")
     return ", ".join(inputs)
-
-
-def _save(trajectory: Trajectory, path: Path) -> None:
-    """Save a trajectory in a folder that need not be there."""
-    make_folder(path.parent)
-    trajectory.save(path)
 
 
 def _run_method(
@@ -675,7 +656,9 @@ def _score_pairs(
     for row in table.drop_duplicates("next").itertuples():
         prev: Any = row.prev
         curr: Any = row.next
-        if not keeps_all and not _has_same_camera(sequence, prev, curr):
+        if not keeps_all and not scores.same_intrinsics(
+            sequence.camera(prev), sequence.camera(curr)
+        ):
             left_out.append({"index": prev, "reason": "the intrinsics change"})
             table = table[table["next"] != curr]
         elif row.missing:
@@ -689,11 +672,6 @@ def _score_pairs(
     table = table.assign(sequence=sequence.name, flow_source=flow_source)
     table = table.sort_values("index", kind="stable")
     return scores.pair_table(table), left_out
-
-
-def _has_same_camera(sequence: Sequence, prev: int, curr: int) -> bool:
-    """Return whether two frames have the same intrinsics."""
-    return scores.same_intrinsics(sequence.camera(prev), sequence.camera(curr))
 
 
 # -- the results -------------------------------------------------------------------------
