@@ -11,7 +11,6 @@ import pytest
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import Reason, RelativePose, Status, Step
 from hybridvo.core.types import Frame
-from hybridvo.run.commands.advice import likely_causes
 from hybridvo.run.commands.diagnosis.causes import CAUSES, depth_delay, likely_cause
 from tests import worlds
 
@@ -91,10 +90,3 @@ def test_the_delay_of_depth_is_that_of_its_stamps() -> None:
 
     assert depth_delay(Stamped(), 1) == pytest.approx(0.015)
     assert depth_delay(object(), 1) == 0.0
-
-
-def test_causes_are_counted() -> None:
-    assert likely_causes(["", ""]) == []
-    (sentence,) = likely_causes(["blur", "", "clocks", "clocks"])
-    assert sentence.startswith("likely causes: 2 clocks: ")
-    assert "; 1 blur: " in sentence

@@ -107,20 +107,16 @@ def test_a_scene_of_sintel_may_be_named_by_any_of_its_parts(dataset, tmp_path):
     assert set(SCENE_FOLDERS) == set(SINTEL_PARTS)
     scene = dataset.parents[1] / "invalid" / dataset.name
     assert not scene.exists()
-    assert (
-        main(
-            [
-                "run",
-                str(scene),
-                "--out",
-                str(tmp_path),
-                "--method",
-                "identity",
-                "-q",
-            ]
-        )
-        == 0
-    )
+    words = [
+        "run",
+        str(scene),
+        "--out",
+        str(tmp_path),
+        "--method",
+        "identity",
+        "-q",
+    ]
+    assert main(words) == 0
 
 
 @pytest.mark.slow

@@ -58,15 +58,6 @@ def test_a_comparison_has_its_table_without_the_errors_of_paths(
     shutil.rmtree(out)
 
 
-@pytest.mark.long
-def test_the_demo_has_its_table_without_the_errors_of_paths(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    done = run_without("evo", "demo", "--frames", 2, "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert REMEDY in done.stderr
-    assert "hybridvo (hybrid)" in done.stdout
-
-
 def test_the_public_call_returns_none_with_a_reason(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
