@@ -182,6 +182,8 @@ class Ranking:
     @property
     def margin(self) -> float:
         """By how much the best score exceeds that of any other motion of this flow."""
+        if is_alone_without_images(self.found):
+            return MAX_SCORE_MARGIN
         return score_margin(self.found, self.poses, self.score)
 
     def mask_of(self, number: int) -> np.ndarray | None:
@@ -217,6 +219,14 @@ def margin_of(rankings: Sequence[Ranking]) -> float:
     poses = [pose for ranking in rankings for pose in ranking.poses]
     scores = np.concatenate([ranking.score for ranking in rankings])
     return score_margin(surest(rankings).found, poses, scores)
+
+
+def is_alone_without_images(found: HypothesisSet) -> bool:
+    """Whether one motion explains nearly all flow of a pair without images.
+
+    PWVO was trained on none of these, and scores them as "none of them".
+    """
+    return found.is_complete and not found.pair.has_images
 
 
 def select_from(rankings: Sequence[Ranking]) -> Selection:

@@ -74,6 +74,8 @@ DEPTH_LEAD_STD = 5.0
 images 6 and more, with the noise of structured light."""
 CONTRADICTED_RIGHT = 0.1
 """Probability of a motion that images or depth maps contradict: none of 57 was right."""
+NO_MOTION_PROBABILITY = 0.05
+"""Probability of being right below which a motion is not applied to the path."""
 
 # Whether images and depth maps contradict a motion.
 

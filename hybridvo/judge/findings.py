@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import RelativePose, Status
+from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import FlowProvider
 
@@ -57,6 +57,15 @@ def covering(T_apart: np.ndarray) -> np.ndarray:
 def towards(motion: RelativePose, T_curr_prev: np.ndarray) -> np.ndarray:
     """Return the covariance (6, 6) with which a motion covers another one (4, 4)."""
     return covering(T_curr_prev @ invert(motion.T_curr_prev))
+
+
+def improbable(motion: RelativePose) -> Finding:
+    """Find that a motion is not the camera's with its own probability."""
+    percent = 100 * motion.probability
+    text = f"the motion found has a probability of {percent:.0f} %"
+    return Finding(
+        np.zeros((6, 6)), 0.0, Status.failed(Reason.AMBIGUOUS_MOTION, text)
+    )
 
 
 def others_possible(motion: RelativePose) -> Finding:

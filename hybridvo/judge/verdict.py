@@ -9,9 +9,10 @@ from __future__ import annotations
 from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.stages import stage
+from hybridvo.judge.calibration import NO_MOTION_PROBABILITY
 from hybridvo.judge.consistency import against_images_and_depth
 from hybridvo.judge.false_depth import false_depth
-from hybridvo.judge.findings import Finding, Question, others_possible
+from hybridvo.judge.findings import Finding, Question, improbable, others_possible
 
 
 @stage("judge")
@@ -37,11 +38,15 @@ def judge(question: Question, is_compared: bool = True) -> RelativePose:
 
 
 def _as_probable_as_stated(motion: RelativePose) -> RelativePose:
-    """A motion that its own probability makes less certain."""
+    """A motion that its own probability makes failed, or less certain."""
     if not motion.usable:
         return motion
+    reason = motion.status.reason
     # what else is wrong with a motion is stated, and explains the probability
-    if motion.status.reason is Reason.AMBIGUOUS_MOTION:
+    is_doubted_for_that = reason in (Reason.NONE, Reason.AMBIGUOUS_MOTION)
+    if motion.probability < NO_MOTION_PROBABILITY and is_doubted_for_that:
+        return with_finding(motion, improbable(motion))
+    if reason is Reason.AMBIGUOUS_MOTION:
         return with_finding(motion, others_possible(motion))
     return motion
 

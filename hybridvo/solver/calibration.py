@@ -38,6 +38,9 @@ NO_SPREAD = 0.35
 """Of the log ratio of two depths: standard deviation from which an answer is degraded, and from
 which it is none. Real sensors and rendered depth with DIS flow measure 0.001 to 0.018, noise 0.49
 to 0.6."""
+MIN_TILES = 24
+"""Tiles of the whole image in which usable pixels lie, below which a covariance is not
+reliable: depth errs alike over some 50 px (3 of 59 development lines were beyond 3 sigma)."""
 SHARED_SHIFT = 0.12
 """Displacement that whole parts of an image share, as a fraction of the residual's noise in pixels:
 from interpolation, light, blur. NEES of right answers as a multiple of what is expected, with 0,
@@ -54,6 +57,9 @@ QUANTUM_PERCENTILE = 20.0
 EVEN_PARTS = 0.7
 """Dispersion of the parts' scores, as fractions of the model's, below which they agree: rendered
 pairs have 0.25 in the median, 0.55 at the 90th percentile; with a rolling shutter 1.0 and 2.0."""
+WEAK_RATIO = 2e-5
+"""Ratio of the information's extreme eigenvalues below which a direction is degraded: a frontal
+plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
 
 # Refinement on flow and depth
 #

@@ -15,8 +15,10 @@ import numpy as np
 
 from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
 from hybridvo.solver.calibration import MIN_CURVATURE_RATIO
+from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.kernels import HESSIAN_SUMS
 from hybridvo.solver.newton import positive_inverse
+from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.score_blocks import (
     PLACES,
     BlockSums,
@@ -34,6 +36,8 @@ from hybridvo.solver.shared_errors import (
 # of the largest.
 MIN_EIGENVALUE = 1e-12
 MIN_EIGENVALUE_RATIO = 1e-8
+# Name of the error that a seed has as well as the solution.
+OF_DEPTHS = "of depths that differ"
 
 
 class ScoreStatistics(NamedTuple):
@@ -63,8 +67,9 @@ class MotionCovariance(NamedTuple):
         return np.sum(list(self.errors.values()), axis=0)
 
     def of_seed(self, covariance: np.ndarray) -> MotionCovariance:
-        """That of a seed (6, 6) in the place of the solution's."""
-        return self._replace(errors={"of the seed": covariance})
+        """That of a seed (6, 6) in the place of the solution's, with the same depths."""
+        kept = {k: v for k, v in self.errors.items() if k == OF_DEPTHS}
+        return self._replace(errors={"of the seed": covariance, **kept})
 
     @property
     def is_definite(self) -> bool:
@@ -88,13 +93,20 @@ def direction_is_known(T: np.ndarray, covariance: np.ndarray) -> bool:
 
 
 def motion_covariance(
-    statistics: ScoreStatistics, inverse_depth: float
+    statistics: ScoreStatistics,
+    inverse_depth: float,
+    t: np.ndarray,
+    noise: Noise,
+    depths: DepthAgreement | None,
 ) -> MotionCovariance:
     """Return the covariance of the left perturbation of a motion by flow.
 
     Args:
         statistics: of the fit, at its solution.
         inverse_depth: 1 / typical depth, 1 / m: it turns metres into radians.
+        t: (3,) translation, metres.
+        noise: of flow and depth.
+        depths: how the depths of both frames compare along the motion, or None.
 
     Returns:
         The covariance; one without information, and no tiles, where a direction is undetermined.
@@ -108,6 +120,8 @@ def motion_covariance(
         "of parts of the view": _of_parts(statistics.shared, at),
     }
     errors = {name: at.in_metres(each) for name, each in errors.items()}
+    errors["of the mean of depth"] = _of_mean_depth(t, noise)
+    errors[OF_DEPTHS] = _of_depths(t, depths)
     found = MotionCovariance(errors, at.eigenvalues, blocks.tiles)
     is_finite = bool(np.isfinite(found.covariance).all())
     return found if is_finite else unknown_motion(at.eigenvalues)
@@ -198,6 +212,27 @@ def _of_parts(shared: SharedErrors, at: _Solution) -> np.ndarray:
     effects = effects.reshape(rows * columns, -1, 6)
     part_of = parts_of_tiles(rows, columns)
     return shared.coherent * shared_covariance(effects, part_of)
+
+
+def _of_mean_depth(t: np.ndarray, noise: Noise) -> np.ndarray:
+    """Covariance (6, 6) by what the errors of depth are 0 in the mean of.
+
+    It may be log depth, depth or its inverse: these differ by half the variance of log depth, and
+    so does the length of the translation (3,).
+    """
+    return _of_length(t, (0.5 * noise.log_depth**2) ** 2)
+
+
+def _of_depths(t: np.ndarray, depths: DepthAgreement | None) -> np.ndarray:
+    """Covariance (6, 6) by a length of the translation (3,) as uncertain as depths that differ."""
+    return _of_length(t, 0.0 if depths is None else depths.length_variance)
+
+
+def _of_length(t: np.ndarray, variance: float) -> np.ndarray:
+    """Covariance (6, 6) by the relative variance of the length of a translation (3,)."""
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = variance * np.outer(t, t)
+    return covariance
 
 
 # -- of a motion by several sources: information adds up --------------------------------

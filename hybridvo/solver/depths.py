@@ -118,6 +118,13 @@ class DepthAgreement(NamedTuple):
             )
         return Status()
 
+    @property
+    def length_variance(self) -> float:
+        """Relative variance of the length of a translation by depths that differ."""
+        if self.status.ok:
+            return 0.0
+        return float(np.log(self.ratio) ** 2 + self.log_deviation**2)
+
 
 def compare_depths(
     pair: FramePair, T_curr_prev: np.ndarray, weights: np.ndarray | None

@@ -30,7 +30,7 @@ from hybridvo.solver.covariance import (
     ScoreStatistics,
     motion_covariance,
 )
-from hybridvo.solver.depths import compare_depths
+from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.kernels import (
     HESSIAN_SUMS,
     ResidualNoise,
@@ -51,7 +51,7 @@ from hybridvo.solver.shared_errors import (
     coherent_fraction,
     tile_pulls,
 )
-from hybridvo.solver.status import FitSummary, status_of
+from hybridvo.solver.status import FitSummary, degeneracy, status_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ def refine_pair(
     depths = None
     if depth_curr is not None:
         depths = compare_depths(pair, T, fit.at.weights)
-    stated = _covariance(grid, fit.at, T, estimate.noise, options)
+    stated = _covariance(grid, fit.at, T, estimate.noise, depths, options)
     motion = _motion(T, fit.at, estimate).replace(
         iterations=coarse_steps + steps + 1,
         hypotheses=start.hypotheses,
@@ -192,7 +192,13 @@ def refine_pair(
         converged=_has_converged(fit),
         max_steps=coarse_steps + steps + 1,
     )
-    status = status_of(summary, depths, start.probability, min_probability)
+    status = status_of(
+        summary,
+        depths,
+        start.probability,
+        min_probability,
+        degeneracy(stated, grid.size, options),
+    )
     inlier_ratio = min(1.0, motion.inlier_ratio * start.coverage)
     motion = motion.replace(status=status, inlier_ratio=inlier_ratio)
     if not status.usable:
@@ -254,13 +260,14 @@ def _covariance(
     at: FlowLinearization,
     T: np.ndarray,
     noise: Noise,
+    depths: DepthAgreement | None,
     options: RefineOptions,
 ) -> MotionCovariance:
     """Return the covariance of a motion (4, 4) from the linearization at its solution."""
     shared = _shared_errors(grid, at, T[:3], noise, options)
     statistics = ScoreStatistics(at.tiles, at.curvature, at.meat, shared)
     inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
-    return motion_covariance(statistics, inverse_depth)
+    return motion_covariance(statistics, inverse_depth, T[:3, 3], noise, depths)
 
 
 def _shared_errors(

@@ -5,12 +5,19 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
+from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, Status
 from hybridvo.solver.calibration import (
     MIN_INLIER_RATIO,
     MIN_ROBUST_SUM,
+    MIN_TILES,
+    WEAK_RATIO,
 )
+from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.depths import DepthAgreement
+from hybridvo.solver.newton import tile_size
 
 NO_SEARCH = Status.degraded(
     Reason.AMBIGUOUS_MOTION,
@@ -24,6 +31,25 @@ LEFT_SEED = Status.degraded(
     "the fit to all pixels leaves the region that the covariance of its seed states; the motion "
     "is that of the seed",
 )
+
+
+def degeneracy(
+    estimate: MotionCovariance, size: tuple[int, int], options: RefineOptions
+) -> str:
+    """Return what makes a motion uncertain although it is determined; empty if nothing does.
+
+    Args:
+        estimate: its covariance and the tiles behind it.
+        size: (H, W) of the image.
+        options: how many tiles an image has.
+    """
+    eigenvalues = estimate.eigenvalues
+    if eigenvalues[0] < WEAK_RATIO * eigenvalues[-1]:
+        return "a direction of the motion is barely determined"
+    tiles_of_image = np.prod(size) / tile_size(size, options.tiles) ** 2
+    if estimate.tiles < MIN_TILES <= 0.5 * tiles_of_image:
+        return "the pixels cover too little of the image to measure how far their errors agree"
+    return ""
 
 
 class FitSummary(NamedTuple):
@@ -54,6 +80,7 @@ def status_of(
     depths: DepthAgreement | None,
     probability: float,
     min_probability: float,
+    degenerate: str = "",
 ) -> Status:
     """Return the status of a motion: the first reason that holds, the gravest first.
 
@@ -62,6 +89,7 @@ def status_of(
         depths: how the depths of both frames compare along the motion, or None.
         probability: that this is the camera's motion; NaN where nothing states it.
         min_probability: below it the motion is degraded.
+        degenerate: what :func:`degeneracy` states.
     """
     if not fit.is_determined:
         return Status.failed(
@@ -86,6 +114,8 @@ def status_of(
         return NO_SEARCH
     if probability < min_probability:
         return ambiguous(probability)
+    if degenerate:
+        return Status.degraded(Reason.DEGENERATE_GEOMETRY, degenerate)
     return Status()
 
 

@@ -289,7 +289,7 @@ def test_motions_with_little_parallax(
 )
 @of_methods(HERE)
 def test_small_and_odd_images(method: str, size: tuple[int, int]) -> None:
-    pair, T = worlds.world(size)
+    pair, T = worlds.world(size, noise=(0.1, 0.005))
     found = estimate(pair, method=method)
     worlds.assert_sane(found)
     if method in OWN:

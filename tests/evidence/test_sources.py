@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,11 +10,9 @@ import pytest
 from hybridvo import pipeline
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
-from hybridvo.core.types import Frame, FramePair
+from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.flow.providers import FlowField, dis_flow
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.pipeline import Context, Found, by_first_source, first_sure
 from hybridvo.tracking.odometry import Odometry
 
@@ -142,35 +139,3 @@ def evidence_of_a_pair() -> PairEvidence:
     scene = make_scene("static", 0, height=48, width=64, frames=2)
     pair = FramePair(scene.render(0), scene.render(1), None)
     return Context().evidence(pair)
-
-
-def test_images_that_are_sure_from_the_frame_before_are_tied_to_the_keyframe(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    """No flow is computed, and errors of neighbouring frames do not add up."""
-    scene = slow_scene("static", 3, 6, (120, 160))
-    frames = [replace(scene.render(k), index=k) for k in range(6)]
-    flows = []
-
-    def noted(prev: Frame, curr: Frame) -> FlowField:
-        flows.append((prev.index, curr.index))
-        return dis_flow()(prev, curr)
-
-    noted.source = "dis"
-    odometry = Odometry(flow=noted)
-    for frame in frames[:4]:
-        assert odometry.track(frame).ok
-    by_images = pipeline.by_images
-
-    def unsure_from_the_keyframe(evidence: PairEvidence) -> Found | None:
-        return None if evidence.pair.prev.index == 0 else by_images(evidence)
-
-    monkeypatch.setattr(pipeline, "by_images", unsure_from_the_keyframe)
-    odometry.resume(replace(odometry.state, used_flow=False))
-    flows.clear()
-    step = odometry.track(frames[4])
-    assert step.ok
-    assert not flows
-    newest = odometry.state.keyframes[-1]
-    assert newest.frame.index == 4
-    assert newest.origin == 0

@@ -56,7 +56,7 @@ def seen(left_px: float, right_px: float) -> tuple[PointResiduals, PlaneFactor]:
     ones = np.ones(SIZE, np.float32)
     planes = PlaneFactor(pair, ones, 0.0, RefineOptions())
     at = planes.at(np.eye(4))
-    return compare_points(pair, planes, at, NO_MOTION, 0.0), planes
+    return compare_points(pair, planes, at, NO_MOTION), planes
 
 
 def test_of_a_right_motion_regions_stay_within_the_noise() -> None:
@@ -84,7 +84,7 @@ def test_a_view_without_texture_shows_no_shift() -> None:
     )
     planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 0.0, RefineOptions())
     at = planes.at(np.eye(4))
-    images = compare_points(pair, planes, at, NO_MOTION, 0.0)
+    images = compare_points(pair, planes, at, NO_MOTION)
     outside = images._replace(inside=np.zeros_like(images.inside))
     assert shift_of_regions(outside, planes) == 0.0
     assert np.isfinite(shift_of_regions(images, planes))

@@ -77,20 +77,6 @@ def test_uneven_light_leaves_little(both, made):
     )
 
 
-def test_another_image_is_refused(made):
-    prev, curr, _, _ = made
-    field = dis_flow()(prev, curr)
-    other = SyntheticSequence(
-        make_scene("static", 405, height=HEIGHT, width=WIDTH, frames=2)
-    )
-    pair = FramePair(prev, curr, field.flow, field.variance, field.valid, "dis")
-    motion = refine(pair)
-    done = refine_photometric(replace(pair, curr=other.frame(0)), motion)
-    assert not done.photometric.taken
-    assert "images not used" in done.status.message
-    np.testing.assert_array_equal(done.T_curr_prev, motion.T_curr_prev)
-
-
 def test_rows_taken_one_after_the_other_lower_the_weight(made):
     prev, curr, _, flow = made
     base = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).astype(

@@ -357,25 +357,6 @@ def test_two_depths_that_differ_are_never_ok(name: str, change) -> None:
     assert kept.status[1].ok
 
 
-def test_the_length_is_as_uncertain_as_the_depths_differ() -> None:
-    """As of a single pair: a quarter of the length, where they differ by a factor of 1.3."""
-    single, _ = worlds.world()
-    curr = replace(single.curr, depth=1.3 * single.curr.depth)
-    changed = replace(single, curr=curr)
-    one = refine(changed, np.eye(4))
-    batch = PairBatch.from_pairs([changed])
-    found = refine_batch(batch, np.eye(4)[None], preferring(batch)).one(0)
-    assert found.status.reason is one.status.reason is Reason.NO_VALID_DEPTH
-    t = found.T_curr_prev[:3, 3]
-    along = t @ found.covariance[:3, :3] @ t / (t @ t)
-    assert np.sqrt(along) == pytest.approx(
-        math.log(1.3) * np.linalg.norm(t), rel=0.02
-    )
-    np.testing.assert_allclose(
-        found.covariance, one.covariance, rtol=0.05, atol=1e-9
-    )
-
-
 def test_a_covariance_is_positive_definite_or_the_sample_failed() -> None:
     """An exact room, whose rotation is known 1e5 times as well as the length of the motion."""
     single, _ = worlds.world()
@@ -395,3 +376,22 @@ def test_a_covariance_is_positive_definite_or_the_sample_failed() -> None:
     assert checked(found, np.eye(4)).tiles == 40
     open_one = found.of_seed(np.diag([1.0, 1, 1, 1, 1, -1e-9]))
     assert checked(open_one, np.eye(4)).tiles == 0
+
+
+def test_the_length_is_as_uncertain_as_the_depths_differ() -> None:
+    """As of a single pair: a quarter of the length, where they differ by a factor of 1.3."""
+    single, _ = worlds.world()
+    curr = replace(single.curr, depth=1.3 * single.curr.depth)
+    changed = replace(single, curr=curr)
+    one = refine(changed, np.eye(4))
+    batch = PairBatch.from_pairs([changed])
+    found = refine_batch(batch, np.eye(4)[None], preferring(batch)).one(0)
+    assert found.status.reason is one.status.reason is Reason.NO_VALID_DEPTH
+    t = found.T_curr_prev[:3, 3]
+    along = t @ found.covariance[:3, :3] @ t / (t @ t)
+    assert np.sqrt(along) == pytest.approx(
+        math.log(1.3) * np.linalg.norm(t), rel=0.02
+    )
+    np.testing.assert_allclose(
+        found.covariance, one.covariance, rtol=0.05, atol=1e-9
+    )

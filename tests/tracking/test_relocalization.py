@@ -211,13 +211,13 @@ def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
     ctx = pipeline.Context()
     pair = FramePair(frames[0], frames[1], None)
     pipeline.first_sure([ctx.evidence(pair)], "hybrid", ctx, deadline=0.0)
-    assert tried == ["images", "flow", "depth"]
+    assert tried == ["images", "flow"]
     tried.clear()
     pipeline.first_sure([ctx.evidence(pair)], "hybrid", ctx)
     assert len(tried) == 5
 
 
-def _asked(monkeypatch, frames, motions, confirm=lambda answer: answer):
+def _asked(monkeypatch, frames, motions):
     """Which of two pairs was asked in turn, where each source finds a given motion of each."""
     asked = []
 
@@ -234,22 +234,8 @@ def _asked(monkeypatch, frames, motions, confirm=lambda answer: answer):
     pairs = [
         ctx.evidence(FramePair(frame, frames[2], None)) for frame in frames[:2]
     ]
-    pipeline.first_sure(pairs, "hybrid", ctx, confirm=confirm)
+    pipeline.first_sure(pairs, "hybrid", ctx)
     return asked
-
-
-def test_a_sure_motion_that_is_not_confirmed_is_asked_first(frames, monkeypatch):
-    doubtful = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "")
-    sure = hvo.RelativePose(covariance=np.eye(6))
-    answers = []
-
-    def only_the_second(answer):
-        answers.append(answer)
-        return answer if len(answers) > 1 else None
-
-    motions = ([doubtful, doubtful], [sure, sure])
-    asked = _asked(monkeypatch, frames, motions, only_the_second)
-    assert asked == [0, 1, 1]
 
 
 def test_costly_sources_are_asked_about_the_surest_pair_alone(frames, monkeypatch):
@@ -258,7 +244,7 @@ def test_costly_sources_are_asked_about_the_surest_pair_alone(frames, monkeypatc
         return nothing.replace(probability=probability)
 
     motions = (4 * [doubtful(0.2)], 4 * [doubtful(0.6)])
-    assert _asked(monkeypatch, frames, motions) == [0, 1, 0, 1, 0, 1, 1]
+    assert _asked(monkeypatch, frames, motions) == [0, 1, 0, 1, 1, 1]
 
 
 def test_an_answer_that_is_late_is_not_improved(frames):

@@ -19,6 +19,7 @@ from hybridvo.solver.covariance import (
 )
 from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.newton import tile_size
+from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.score_blocks import UPPER
 from hybridvo.solver.shared_errors import SharedErrors, coherent_fraction
@@ -84,6 +85,8 @@ def batch_covariances(
         fit.curvature,
         fit.meat,
         _inverse_depth(fit.subset),
+        fit.T.translation(),
+        model.noise,
     )
     samples = zip(*(x.double().cpu().numpy() for x in values), strict=True)
     statistics = PixelStatistics._make(
@@ -92,7 +95,10 @@ def batch_covariances(
     motions = matrix.double().cpu().numpy()
     robust = statistics.followed(pixels).view_as(batch.depth_prev)
     depths = _depth_agreements(batch, motions, robust, options)
-    by_pixels = [_sample_covariance(*sample) for sample in samples]
+    by_pixels = [
+        _sample_covariance(compared, *sample)
+        for sample, compared in zip(samples, depths, strict=True)
+    ]
     of_seeds = fit.region.covariance_to(fit.solution).cpu().numpy()
     covariances = [
         checked(estimate.of_seed(of_seed) if kept else estimate, T)
@@ -184,20 +190,25 @@ def _inverse_depth(subset: Pixels) -> torch.Tensor:
 
 
 def _sample_covariance(
+    depths: DepthAgreement | None,
     tiles: np.ndarray,
     pulls: np.ndarray,
     coherent: np.ndarray,
     curvature: np.ndarray,
     meat: np.ndarray,
     inverse_depth: np.ndarray,
+    t: np.ndarray,
+    noise: np.ndarray,
 ) -> MotionCovariance:
     """Return the covariance of one motion; no tiles where it is not finite."""
     shared = SharedErrors(pulls, float(coherent))
-    values = (*shared, tiles, curvature, meat, inverse_depth)
+    values = (*shared, tiles, curvature, meat, inverse_depth, t, noise)
     if not all(np.isfinite(x).all() for x in values):
         return unknown_motion(np.zeros(6))
     statistics = ScoreStatistics(tiles, curvature, meat, shared)
-    return motion_covariance(statistics, float(inverse_depth))
+    return motion_covariance(
+        statistics, float(inverse_depth), t, Noise(*noise), depths
+    )
 
 
 def _depth_agreements(

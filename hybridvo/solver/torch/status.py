@@ -23,7 +23,7 @@ from hybridvo.solver.calibration import (
 )
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.pixels import too_few
-from hybridvo.solver.status import FitSummary, status_of
+from hybridvo.solver.status import FitSummary, degeneracy, status_of
 from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.covariance import BatchCovariance
 from hybridvo.solver.torch.factors import Pixels
@@ -96,6 +96,7 @@ def judged_batch(
                 stated.depths[k],
                 probabilities.values[k],
                 start_evidence.min_probability,
+                degeneracy(estimate, _size(batch), options),
             )
         )
     covariance = [
@@ -120,6 +121,12 @@ def judged_batch(
         inlier_ratio=inlier_ratio,
         evidence=probabilities.evidence,
     )
+
+
+def _size(batch: PairBatch) -> tuple[int, int]:
+    """Return (H, W) of the images."""
+    height, width = batch.depth_prev.shape[1:]
+    return height, width
 
 
 def _too_few_pixels(
