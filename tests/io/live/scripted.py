@@ -130,3 +130,18 @@ def wait_until(is_so: Callable[[], bool]) -> None:
             return
         pause.wait(0.001)
     raise AssertionError("waited for nothing")
+
+
+class Clock:
+    """Time that passes when somebody sleeps."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.slept: list[float] = []
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds

@@ -18,29 +18,14 @@ from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.cameras.settings import CameraSettings, preset_names, read_preset
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.data.streams import Lens
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
-
-NAMES = (
-    "azure_kinect",
-    "d435",
-    "d455",
-    "femto_bolt",
-    "kinect_v1",
-    "kinect_v2",
-    "oak_d_pro",
-    "zed_2i",
-)
+from tests.io.live.scripted import Clock
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_preset_reads_and_says_what_noise_to_expect(name: str) -> None:
+@pytest.mark.parametrize("name", preset_names())
+def test_a_preset_reads(name: str) -> None:
     settings = read_preset(name)
     assert settings.max_depth_m is not None
     assert 0 < settings.min_depth_m < settings.max_depth_m
-    text = Path(f"configs/cameras/{name}.yaml").read_text(encoding="utf-8")
-    assert "# Depth noise: " in text
-    assert name in preset_names()
 
 
 @pytest.mark.parametrize(
@@ -63,12 +48,6 @@ def test_a_preset_that_is_wrong_is_refused(
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["d436", "../d435", "no/such.yaml"])
-def test_an_unknown_preset_names_the_known_ones(name: str) -> None:
-    with pytest.raises(hvo.InputError, match="d435, d455"):
-        read_preset(name)
-
-
 @pytest.mark.parametrize(
     ("name", "preset", "problem"),
     [
@@ -85,9 +64,10 @@ def test_a_choice_that_cannot_be_is_refused(name, preset, problem: str) -> None:
         choose_camera(name, preset)
 
 
-def test_a_missing_sdk_names_its_extra() -> None:
-    with pytest.raises(hvo.InputError, match=r"pip install 'hybridvo\[oak\]'"):
-        load_sdk("hybridvo_has_no_such_sdk", "oak")
+@pytest.mark.parametrize("name", ["d436", "../d435"])
+def test_an_unknown_preset_names_the_known_ones(name: str) -> None:
+    with pytest.raises(hvo.InputError, match="d435, d455"):
+        read_preset(name)
 
 
 def test_a_broken_sdk_says_why(tmp_path: Path, monkeypatch) -> None:
@@ -127,16 +107,6 @@ def test_the_shutter_is_that_of_the_settings(image_walk: Path) -> None:
         assert reading.frame.camera.readout_ms == expected
 
 
-def test_only_presets_whose_times_were_measured_state_them() -> None:
-    stated = {}
-    for name in preset_names():
-        settings = read_preset(name)
-        times = (settings.readout_ms, settings.depth_lag_ms)
-        if times != (0, 0):
-            stated[name] = times
-    assert stated == {"d435": (32, 0)}
-
-
 def test_an_infrared_image_is_of_the_time_of_its_depth() -> None:
     camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
     for image, expected in (("color", (32, 7)), ("infrared", (0, 0))):
@@ -172,21 +142,6 @@ def test_the_lens_bends_nothing_afterwards() -> None:
 # -- recordings --------------------------------------------------------------------------
 
 
-class Clock:
-    """Time that passes when somebody sleeps."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.slept: list[float] = []
-
-    def __call__(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(seconds)
-        self.now += seconds
-
-
 def play(recording: Path | Sequence) -> tuple[FolderCamera, Clock]:
     clock = Clock()
     camera = FolderCamera(recording, clock=clock, sleep=clock.sleep)
@@ -209,23 +164,6 @@ def test_a_recording_plays_at_its_own_rate(image_walk: Path) -> None:
         np.testing.assert_array_equal(reading.frame.rgb, sequence[index].rgb)
     with pytest.raises(EndOfFrames):
         camera.read(9.0)
-
-
-def test_a_rendered_scene_plays_to_its_end() -> None:
-    scene = make_scene("static", 0, height=12, width=16, frames=3)
-    camera, _ = play(SyntheticSequence(scene))
-    for index in range(3):
-        reading = camera.read(9.0)
-        assert reading is not None and reading.number == index
-        # it has no sensor beside the camera
-        assert reading.imu is None
-
-
-def test_waiting_for_a_frame_ends_in_time(image_walk: Path) -> None:
-    camera, clock = play(image_walk)
-    camera.read(0.001)
-    assert camera.read(0.001) is None
-    assert clock.slept == [0.001]
 
 
 def test_frames_that_are_overtaken_are_left_out(image_walk: Path) -> None:
@@ -254,28 +192,6 @@ def test_a_damaged_frame_is_said(image_walk: Path, monkeypatch) -> None:
     assert reading.frame is None
     assert reading.note == "frame 0: 0.png: cut off"
     assert not reading.is_gone
-
-
-def test_a_frame_is_named_once(image_walk: Path, monkeypatch) -> None:
-    camera, _ = play(image_walk)
-
-    def broken(index: int):
-        raise FormatError(f"{camera.name}: frame {index} (a, b): sizes differ")
-
-    monkeypatch.setattr(camera._sequence, "frame", broken)
-    assert camera.read(9.0).note == "frame 0 (a, b): sizes differ"
-
-
-def test_a_library_of_the_system_that_is_missing_is_named(monkeypatch) -> None:
-    def broken(name: str):
-        raise ImportError("libusb-1.0.so.0: cannot open shared object file")
-
-    monkeypatch.setattr("hybridvo.io.cameras.base.importlib.import_module", broken)
-    with pytest.raises(hvo.InputError, match=r"apt-get install libusb-1\.0-0"):
-        load_sdk("pyrealsense2", "realsense")
-    with pytest.raises(hvo.InputError) as caught:
-        load_sdk("depthai", "oak")
-    assert "apt-get" not in str(caught.value)
 
 
 def test_files_that_are_gone_are_named_as_such(

@@ -5,23 +5,19 @@ from __future__ import annotations
 import json
 import threading
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import hybridvo as hvo
 from hybridvo.io.cameras.base import Reading
-from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.cameras.inertial import CameraImu, ImuBuffer
 from hybridvo.io.cameras.predicted import PredictedCamera
-from hybridvo.io.cameras.settings import CameraSettings
 from hybridvo.run.commands import live as command
-from hybridvo.run.commands.arguments import build_parser
 from tests import captures
 from tests.io.data.test_stereo import euroc_folder
-from tests.io.live.scripted import LONG_S, ScriptedCamera, Tracker, reading
+from tests.io.live.scripted import LONG_S, Clock, ScriptedCamera, Tracker, reading
 from tests.io.live.test_stream import run
 
 MOUNT = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
@@ -107,21 +103,6 @@ def test_readings_that_nobody_takes_do_not_pile_up() -> None:
 # -- a stream --------------------------------------------------------------------------------
 
 
-def test_samples_go_to_the_tracker_with_their_frame() -> None:
-    tracker = Tracker()
-    camera = ScriptedCamera(
-        reading(5.0),
-        reading(5.1, imu=samples(5.02, 5.07)),
-        reading(5.2),
-    )
-    run(camera, tracker)
-    assert tracker.samples[0] is None and tracker.samples[2] is None
-    given = tracker.samples[1]
-    assert given is not None
-    np.testing.assert_array_equal(given.stamps, [5.02, 5.07])
-    np.testing.assert_array_equal(given.R_cam_imu, MOUNT)
-
-
 def test_samples_of_frames_that_were_replaced_are_not_lost() -> None:
     tracked = threading.Event()
     given = threading.Event()
@@ -190,28 +171,7 @@ def test_what_is_known_survives_images_of_another_size() -> None:
     assert steps.summary()["gravity"] == second.summary()
 
 
-def test_a_note_of_a_frame_that_can_be_used_is_said() -> None:
-    camera = ScriptedCamera(
-        reading(5.0, note="its IMU is not used: why"), reading(5.1)
-    )
-    _, found, said = run(camera)
-    assert len(found) == 2
-    assert said == ["scripted: its IMU is not used: why"]
-
-
 # -- recordings, networks, the command -----------------------------------------------------------
-
-
-class Clock:
-    """Time that passes when somebody sleeps."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
 
 
 def played(root: Path, imu: bool) -> list[Reading]:
@@ -235,27 +195,6 @@ def test_a_network_leaves_the_samples_alone() -> None:
     camera = ScriptedCamera(reading(5.0, imu=samples(4.99)), hasty=True)
     predicted = PredictedCamera(camera, [lambda frame: frame])
     np.testing.assert_array_equal(predicted.read(1.0).imu.stamps, [4.99])
-
-
-def test_the_switch_reaches_the_camera(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert CameraSettings().imu
-    parse = build_parser().parse_args
-    assert parse(["live", "--camera", "x"]).imu
-    assert not parse(["live", "--camera", "x", "--no-imu"]).imu
-    root = captures.with_imu(euroc_folder(tmp_path))
-    for wanted in (True, False):
-        camera = choose_camera(str(root), imu=wanted)
-        assert isinstance(camera, FolderCamera) and camera._uses_imu is wanted
-    made: list[Any] = []
-    monkeypatch.setattr(
-        "hybridvo.io.cameras.choose.OakCamera",
-        lambda settings: made.append(settings),
-    )
-    choose_camera("oak", imu=False)
-    choose_camera("oak", "oak_d_pro")
-    assert [each.imu for each in made] == [False, True]
 
 
 def test_lines_of_json_state_gravity_where_it_is_known() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +15,7 @@ from hybridvo.io.cameras.base import EndOfFrames
 from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.io.cameras.realsense import RealSenseCamera
 from hybridvo.io.cameras.settings import CameraSettings, read_preset
-from hybridvo.io.live import stream
-from tests.io.live.scripted import LONG_S, QUICK, Tracker
+from tests.io.live.scripted import LONG_S
 
 try:
     import pyrealsense2 as rs
@@ -199,19 +197,6 @@ def test_a_clock_of_its_own_tells_no_age(
     assert reading.age_s == 0.0
 
 
-def test_nothing_comes_in_time(camera: RealSenseCamera) -> None:
-    assert camera.read(0.01) is None
-
-
-def test_options_are_set(soft: SoftCamera, camera: RealSenseCamera) -> None:
-    assert soft.rgb.get_option(rs.option.gain) == 7.0
-
-
-def test_an_unknown_option_is_refused() -> None:
-    with pytest.raises(hvo.InputError, match="no option is called 'emiter'"):
-        RealSenseCamera(settings(options={"emiter": 1}))
-
-
 @pytest.mark.parametrize("name", ["d435", "d455"])
 def test_every_option_of_a_preset_is_one_of_the_sdk(name: str) -> None:
     RealSenseCamera(read_preset(name))
@@ -245,22 +230,6 @@ def test_distortion_is_taken_out_as_the_sdk_models_it() -> None:
     assert np.hypot(at[0] - seen[0], at[1] - seen[1]) < 0.3
 
 
-def test_no_device_is_a_lost_camera_not_the_end() -> None:
-    """Without a camera at hand every attempt fails, and the stream says so until it is stopped."""
-    said: list[str] = []
-    camera = RealSenseCamera(settings(serial="no such serial"))
-    steps = stream(
-        camera,
-        Tracker(),
-        patience=QUICK,
-        say=said.append,
-        stop=lambda: len(said) > 2,
-    )
-    assert list(steps) == []
-    assert all(text.startswith("realsense: ") for text in said)
-    assert steps.counts.lost == 1
-
-
 def test_what_the_sdk_records_is_played(soft: SoftCamera, tmp_path: Path) -> None:
     """The SDK's own recorder writes the file; our reader of bags plays it."""
     pytest.importorskip("rosbags")
@@ -286,37 +255,6 @@ def test_what_the_sdk_records_is_played(soft: SoftCamera, tmp_path: Path) -> Non
     # frames that were due at once are left out
     assert colors and colors == sorted(set(colors))
     assert set(colors) <= {40, 41, 42, 43}
-
-
-def test_a_stream_of_the_sdk_is_tracked(soft: SoftCamera) -> None:
-    camera = RealSenseCamera(settings(), device=soft.device)
-    tracked = threading.Semaphore(0)
-    opened = threading.Event()
-    tracker = Tracker()
-    tracker.on_track = lambda count: tracked.release()
-    real_open = camera.open
-
-    def open_and_tell() -> None:
-        real_open()
-        opened.set()
-
-    camera.open = open_and_tell  # type: ignore[method-assign]
-
-    def feed() -> None:
-        assert opened.wait(LONG_S)
-        for _ in range(5):
-            soft.give_all(time.time())
-            assert tracked.acquire(timeout=LONG_S)
-
-    feeder = threading.Thread(target=feed)
-    feeder.start()
-    steps = stream(camera, tracker, patience=QUICK, max_frames=5)
-    found = list(steps)
-    feeder.join()
-    assert len(found) == 5
-    assert steps.counts.dropped == 0
-    stamps = [live.step.timestamp for live in found]
-    assert (np.diff(stamps) > 0).all()
 
 
 # -- the inertial sensor of a D435i ----------------------------------------------------------
@@ -345,15 +283,6 @@ def test_samples_come_with_the_frame() -> None:
     # at rest it reads upwards, which is -y of the image
     up = samples.R_cam_imu @ samples.accelerations[0]
     np.testing.assert_allclose(up, [0, -9.8, 0], rtol=1e-6)
-
-
-def test_an_imu_that_is_switched_off_is_left_alone() -> None:
-    soft, camera = with_imu(imu=False)
-    soft.read_motion(100.0, 0.1)
-    soft.give_all(100.02)
-    reading = camera.read(LONG_S)
-    camera.close()
-    assert (reading.imu, reading.note) == (None, "")
 
 
 def test_readings_of_another_clock_are_not_used() -> None:
