@@ -37,21 +37,7 @@ TEXT_FILES = [
     ("7scenes", "frame-000001.pose.txt"),
 ]
 DAMAGE = st.binary(max_size=6) | st.sampled_from(
-    [
-        b"9" * 400,
-        b"nan",
-        b"inf",
-        b"-",
-        b"\n",
-        b"\0",
-        b"e999",
-        b"[",
-        b": ",
-        b"*",
-        b"#",
-        b",",
-        b"../",
-    ]
+    [b"9" * 400, b"\n", b"\0", b": ", *b"nan inf - e999 [ * # , ../".split()]
 )
 
 

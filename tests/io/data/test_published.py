@@ -235,25 +235,20 @@ d400_color_optical_frame:
 
 def trans_matrix() -> str:
     """The robot carries the depth camera 0.9 m above the floor, colour 2 cm to its right."""
-    lines = ["%YAML:1.0", "---", "trans_matrix:"]
     # axes of the camera on the robot: x forward is its z, y left is its -x
     turned = "0., 0., 1., 0.2, -1., 0., 0., 0., 0., -1., 0., 0.9, 0., 0., 0., 1."
     beside = "1., 0., 0., 0.02, 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1."
+    text = "%YAML:1.0\n---\ntrans_matrix:\n"
     for parent, child, numbers in (
         ("base_link", "d400_depth_optical_frame", turned),
         ("d400_depth_optical_frame", "d400_color_optical_frame", beside),
     ):
-        lines += [
-            "   -",
-            f"      parent_frame: {parent}",
-            f"      child_frame: {child}",
-            "      matrix: !!opencv-matrix",
-            "         rows: 4",
-            "         cols: 4",
-            "         dt: d",
-            f"         data: [ {numbers} ]",
-        ]
-    return "\n".join(lines) + "\n"
+        text += f"   -\n      parent_frame: {parent}\n      child_frame: {child}\n"
+        text += (
+            "      matrix: !!opencv-matrix\n         rows: 4\n         cols: 4\n"
+        )
+        text += f"         dt: d\n         data: [ {numbers} ]\n"
+    return text
 
 
 def openloris(root: Path) -> Path:

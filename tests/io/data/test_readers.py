@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,8 +10,6 @@ from hybridvo.core.files import fingerprint
 from hybridvo.core.geometry import ego_flow, invert
 from hybridvo.core.types import Camera
 from hybridvo.flow.providers import FlowField
-from hybridvo.io.data.datasets import BONN_MARKER, BONN_ROS
-from hybridvo.io.data.lists import depth_at
 from hybridvo.io.data.open import READERS, iter_pairs, open_sequence
 from tests import sequences as write
 
@@ -74,15 +70,6 @@ def test_reads_back_exactly(kind, tmp_path):
     }
 
 
-def test_fingerprint_tells_changed_input(tmp_path):
-    sequence = open_sequence(write.write_folder(tmp_path).path)
-    before = fingerprint(sequence.files())
-    assert fingerprint(open_sequence(sequence.root).files()) == before
-    path = sequence.root / "poses.txt"
-    path.write_text(path.read_text() + "\n")
-    assert fingerprint(sequence.files()) != before
-
-
 @pytest.mark.parametrize(
     "folder", ["clean", "flow", "depth", "camdata_left", "final"]
 )
@@ -95,19 +82,6 @@ def test_sintel_from_any_sibling(folder, tmp_path):
     assert (sequence.frame(0).rgb is None) == (folder == "final")
 
 
-def test_sintel_without_images_and_with_zips_apart(tmp_path):
-    write.write_sintel(tmp_path / "MPI-Sintel-depth", images=False)
-    path = tmp_path / "MPI-Sintel-depth" / "training" / "depth" / "alley_9"
-    frame = open_sequence(path).frame(1)
-    assert frame.rgb is None and frame.depth is not None
-    apart = tmp_path / "MPI-Sintel-complete" / "training" / "clean" / "alley_9"
-    for i in range(write.N):
-        write.png(apart / f"frame_{i + 1:04d}.png", write.image(i, 5, 8))
-    np.testing.assert_array_equal(
-        open_sequence(apart).frame(1).rgb, write.image(1, 5, 8)
-    )
-
-
 def test_real_tartanair_flow_is_the_rigid_flow(shared_data):
     sequence = open_sequence(shared_data / "tartanair_v2" / "P000")
     flow, valid = sequence.flow(0)
@@ -118,17 +92,6 @@ def test_real_tartanair_flow_is_the_rigid_flow(shared_data):
     # flow is stored in steps of 1/64 px: at most 0.5/64 * sqrt(2) = 0.01105 px of rounding
     assert np.median(error) < 0.0065
     assert error.max() < 0.0112
-
-
-@pytest.mark.parametrize(
-    "name", ["rgbd_dataset_freiburg1_xyz_first10", "redwood_livingroom_5"]
-)
-def test_real_tum(name, shared_data):
-    sequence = open_sequence(shared_data / "tum" / name)
-    assert len(sequence) in (5, 10)
-    assert np.isfinite(sequence.poses).all()
-    depth = sequence[0].depth
-    assert 0.5 < np.median(depth[depth > 0]) < 3
 
 
 def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
@@ -149,26 +112,6 @@ def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
             given.camera(0) == Camera(500, 501, 320, 240, 480, 640)
             and given[0].mask is None
         )
-
-
-def test_bonn_truth_is_that_of_the_camera(tmp_path):
-    plain = open_sequence(write.write_tum(tmp_path / "a").path).poses
-    sequence = open_sequence(
-        write.write_tum(tmp_path / "b", "rgbd_bonn_crowd").path
-    )
-    # by hand: T_ROS swaps y and z and turns x around; the marker's scale of 1.0593 is taken out
-    swap = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
-    lever = np.array([0.0113, -0.0098, 0.0111])
-    R_marker = BONN_MARKER[:, :3] / np.cbrt(np.linalg.det(BONN_MARKER[:, :3]))
-    for T, body in zip(sequence.poses, plain, strict=True):
-        np.testing.assert_allclose(
-            T[:3, :3], swap @ body[:3, :3] @ swap @ R_marker, atol=3e-4
-        )
-        expected = swap @ (body[:3, :3] @ swap @ lever + body[:3, 3])
-        np.testing.assert_allclose(T[:3, 3], expected, atol=1e-12)
-        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.norm(lever) == pytest.approx(0.0186, abs=1e-4)
-    np.testing.assert_array_equal(BONN_ROS @ BONN_ROS, np.eye(4))
 
 
 def test_icl_nuim_is_reflected(tmp_path):
@@ -206,12 +149,8 @@ def test_failure_says_what_was_looked_for(tmp_path):
     with pytest.raises(InputError) as caught:
         open_sequence(tmp_path)
     message = str(caught.value)
-    assert all(f"{name}" in message for name in READERS)
-    assert (
-        "It holds: readme.txt; there is no rgb/." in message
-        and str(tmp_path) in message
-    )
-    assert "\n" not in message and "hybridvo init" in message
+    assert str(tmp_path) in message and "hybridvo init" in message
+    assert "\n" not in message
     for path, words in (
         (tmp_path / "missing", "no such folder"),
         (tmp_path / "v1.0", "no such folder"),
@@ -225,29 +164,6 @@ def test_failure_says_what_was_looked_for(tmp_path):
             open_sequence(path)
     with pytest.raises(InputError, match=r"known: sintel.*hybridvo init"):
         open_sequence(tmp_path, "nyu")
-
-
-def test_the_parent_of_sequences_names_one(tmp_path):
-    for name in ("walk-02", "walk-01"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "frame-000000.color.png").touch()
-        (tmp_path / name / "frame-000000.depth.png").touch()
-    (tmp_path / "readme.txt").touch()
-    with pytest.raises(InputError) as caught:
-        open_sequence(tmp_path)
-    message = str(caught.value)
-    assert f"give one, such as {tmp_path / 'walk-01'}." in message
-    assert "It also holds walk-02." in message
-
-
-def test_clocks_that_differ_say_by_how_much():
-    stamps = 5 + np.arange(15) / 15
-    with pytest.raises(InputError, match=r"depth comes 3 s after colour"):
-        depth_at(stamps, stamps + 3, Path("walk"), [])
-    with pytest.raises(InputError, match=r"depth comes 3\.5 s before colour"):
-        depth_at(stamps, stamps - 3.5, Path("walk"), [])
-    with pytest.raises(InputError, match="there is none"):
-        depth_at(stamps, np.empty(0), Path("walk"), [])
 
 
 @pytest.mark.parametrize("dataset", READERS)
@@ -299,3 +215,25 @@ def test_a_broken_frame_and_a_missing_flow(tmp_path):
         (1, None)
     ]
     assert [frame.index for frame in map(sequence.frame, (1, 2))] == [1, 2]
+
+
+def test_sintel_without_images_and_with_zips_apart(tmp_path):
+    write.write_sintel(tmp_path / "MPI-Sintel-depth", images=False)
+    path = tmp_path / "MPI-Sintel-depth" / "training" / "depth" / "alley_9"
+    frame = open_sequence(path).frame(1)
+    assert frame.rgb is None and frame.depth is not None
+    apart = tmp_path / "MPI-Sintel-complete" / "training" / "clean" / "alley_9"
+    for i in range(write.N):
+        write.png(apart / f"frame_{i + 1:04d}.png", write.image(i, 5, 8))
+    np.testing.assert_array_equal(
+        open_sequence(apart).frame(1).rgb, write.image(1, 5, 8)
+    )
+
+
+def test_fingerprint_tells_changed_input(tmp_path):
+    sequence = open_sequence(write.write_folder(tmp_path).path)
+    before = fingerprint(sequence.files())
+    assert fingerprint(open_sequence(sequence.root).files()) == before
+    path = sequence.root / "poses.txt"
+    path.write_text(path.read_text() + "\n")
+    assert fingerprint(sequence.files()) != before

@@ -78,6 +78,14 @@ def parts(**changes: object) -> dict[str, bytes]:
     return files
 
 
+def stating(**changes: object) -> dict[str, bytes]:
+    return {"metadata": json.dumps(metadata(**changes)).encode()}
+
+
+def every(ending: str, content: bytes) -> dict[str, bytes]:
+    return {f"rgbd/{i}.{ending}": content for i in range(3)}
+
+
 def archive(path: Path, files: dict[str, bytes]) -> Path:
     with zipfile.ZipFile(path, "w") as zipped:
         for name, data in files.items():
@@ -154,23 +162,17 @@ def test_older_metadata_has_no_size_of_depth(tmp_path: Path) -> None:
         ({"metadata": b"{}"}, "192 bytes fit to none"),
         ({"metadata": b"[1]"}, "expected a JSON object"),
         ({"metadata": b"\xff"}, "expected a JSON object"),
-        ({"metadata": json.dumps(metadata(K=[1, 2])).encode()}, "9 numbers"),
-        ({"metadata": json.dumps(metadata(K=[0.0] * 8 + [1])).encode()}, "camera"),
-        ({"metadata": json.dumps(metadata(poses=[[1, 2]])).encode()}, "rows of 7"),
-        ({"metadata": json.dumps(metadata(poses="north")).encode()}, "poses"),
-        ({"metadata": json.dumps(metadata(dw=7)).encode()}, "of one shape"),
-        (
-            {"metadata": json.dumps(metadata(dw=6 * 10**6, dh=8 * 10**6)).encode()},
-            "depth of fewer pixels",
-        ),
-        ({f"rgbd/{i}.jpg": b"no image" for i in range(3)}, "PNG or JPEG"),
-        ({f"rgbd/{i}.depth": b"no stream" for i in range(3)}, r"0\.depth: damaged"),
-        (
-            {f"rgbd/{i}.depth": packed(b"123") for i in range(3)},
-            "expected 192 bytes",
-        ),
-        ({f"rgbd/{i}.depth": bytes(10**5) for i in range(3)}, "at most 4288 bytes"),
-        ({f"rgbd/{i}.conf": packed(b"1") for i in range(3)}, "expected 48 bytes"),
+        (stating(K=[1, 2]), "9 numbers"),
+        (stating(K=[0.0] * 8 + [1]), "camera"),
+        (stating(poses=[[1, 2]]), "rows of 7"),
+        (stating(poses="north"), "poses"),
+        (stating(dw=7), "of one shape"),
+        (stating(dw=6 * 10**6, dh=8 * 10**6), "depth of fewer pixels"),
+        (every("jpg", b"no image"), "PNG or JPEG"),
+        (every("depth", b"no stream"), r"0\.depth: damaged"),
+        (every("depth", packed(b"123")), "expected 192 bytes"),
+        (every("depth", bytes(10**5)), "at most 4288 bytes"),
+        (every("conf", packed(b"1")), "expected 48 bytes"),
     ],
 )
 def test_damage_is_one_line(change: dict, words: str, tmp_path: Path) -> None:
@@ -199,18 +201,6 @@ def test_files_that_are_no_archive(tmp_path: Path) -> None:
     sequence = open_sequence(path)
     with pytest.raises(FormatError, match=r"rgbd/1\.jpg: damaged"):
         sequence[1]
-
-
-@pytest.mark.usefixtures("read_here")
-def test_the_library_that_is_missing_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import hybridvo.io.data.record3d.archive as module
-
-    path = archive(tmp_path / "a.r3d", parts())
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pyliblzfse.*hybridvo\[record3d\]"):
-        open_sequence(path)
 
 
 def test_maps_that_the_library_itself_has_packed(tmp_path: Path) -> None:

@@ -130,33 +130,6 @@ def test_a_plane_before_two_cameras_with_lenses(model: str, tmp_path: Path) -> N
     check_plane(sequence)
 
 
-def test_a_rolling_shutter_stays_one_when_views_are_rectified(
-    tmp_path: Path,
-) -> None:
-    root = own_folder(tmp_path / "mine", count=1)
-    with (root / "camera.yaml").open("a") as file:
-        file.write("readout_ms: 20\n")
-    assert open_sequence(root).camera(0).readout_ms == 20
-
-
-def test_rectified_images_need_a_baseline_alone(tmp_path: Path) -> None:
-    """A disparity of 7 px at 140 px focal length and 0.1 m is 2 m."""
-    rng = np.random.default_rng(4)
-    wide = cv2.GaussianBlur(rng.integers(0, 256, (120, 200), np.uint8), (0, 0), 1.5)
-    for i in range(2):
-        save(tmp_path / "left" / f"{i}.png", wide[:, 20:180])
-        save(tmp_path / "right" / f"{i}.png", wide[:, 27:187])
-    settings = "fx: 140\nfy: 140\ncx: 80\ncy: 60\nwidth: 160\nheight: 120\n"
-    settings += "readout_ms: 20\n"
-    (tmp_path / "camera.yaml").write_text(settings + "stereo: {baseline: 0.1}\n")
-    sequence = open_sequence(tmp_path)
-    assert sequence.camera(0).readout_ms == 20
-    depth = sequence[0].depth
-    found = depth > 0
-    assert found[10:-10, 90:-10].mean() > 0.95
-    assert np.mean(np.abs(depth[found] - 2.0) < 0.02) > 0.95
-
-
 def test_depth_and_variance_by_hand() -> None:
     disparity = np.float32([[20.0, 5.0, 0.0, -1.0]])
     depth, variance = depth_from_disparity(disparity, 10.0)
@@ -267,10 +240,8 @@ def test_a_calibration_of_kalibr(tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"stereo": {"baseline": -0.1}}, "baseline"),
-        ({"stereo": {"baseline": "wide"}}, "baseline"),
         ({"stereo": {"left": {}}}, "left"),
         ({"stereo": None}, "expected 'stereo:'"),
-        ({"t": [0.1, 0, 0]}, "to the right of the left one"),
         ({"t": [0, 0.1, 0]}, "to the right of the left one"),
         ({"t": None}, "stereo"),
         ({"R": np.zeros((3, 3)).tolist()}, "rigid"),
@@ -304,17 +275,11 @@ def test_lists_that_are_damaged(tmp_path: Path) -> None:
     path.write_text("#timestamp\nnow,1.png\n")
     with pytest.raises(FormatError, match=r"data\.csv:2: expected 'timestamp"):
         open_sequence(root)
+    path.write_text("1" * 5000 + ",a.png\n")
+    with pytest.raises(FormatError, match=r"data\.csv:1: expected 'timestamp"):
+        open_sequence(root)
     path.write_text("1403715274312143104,../../../secret.png\n")
     with pytest.raises(FormatError, match="below the sequence's folder"):
-        open_sequence(root)
-
-
-@pytest.mark.parametrize("digits", [20, 400, 5000])
-def test_a_stamp_of_any_length(digits: int, tmp_path: Path) -> None:
-    root = euroc_folder(tmp_path)
-    path = next(root.rglob("cam0/data.csv"))
-    path.write_text("1" * digits + ",a.png\n")
-    with pytest.raises(FormatError, match=r"data\.csv:1: expected 'timestamp"):
         open_sequence(root)
 
 
@@ -360,25 +325,9 @@ def test_a_baseline_in_place_of_a_file(camera: bool, tmp_path: Path) -> None:
     assert sequence.opened_with()["baseline"] == 0.1
 
 
-def test_stereo_on_the_command_line(tmp_path: Path, capsys) -> None:
-    root = rectified(tmp_path / "mine", camera=True)
-    out = tmp_path / "out"
-    command = ["convert", str(root), str(out), "-q"]
-    assert main([*command, "--stereo", "0.1"]) == 0
-    assert open_sequence(out)[0].depth.max() > 0
-    for words, message in (
-        (["--stereo", "mine"], "invalid metres value"),
-        (["--stereo", "-0.1"], "baseline in metres"),
-        (["--stereo"], "expected 'stereo:'"),
-    ):
-        assert main([*command, *words]) == 2
-        assert message in capsys.readouterr().err
-    # a sequence with depth of its own
-    assert main(["convert", str(out), str(tmp_path / "b"), "--stereo"]) == 2
-    assert "with depth of its own" in capsys.readouterr().err
-
-
-def test_stereo_where_the_sequence_states_its_baseline(tmp_path: Path) -> None:
+def test_stereo_where_the_sequence_states_its_baseline(
+    tmp_path: Path, capsys
+) -> None:
     root = euroc_folder(tmp_path / "euroc")
     assert len(open_sequence(root, stereo=True)) == 3
     with pytest.raises(InputError, match="states its own baseline"):
@@ -386,11 +335,17 @@ def test_stereo_where_the_sequence_states_its_baseline(tmp_path: Path) -> None:
     mine = rectified(tmp_path / "mine", camera=False)
     with pytest.raises(InputError, match="--camera fx,fy,cx,cy"):
         open_sequence(mine, stereo=0.1)
-    bent = "fx: 140\nfy: 140\ncx: 80\ncy: 60\nwidth: 160\nheight: 120\n"
-    bent += "distortion: [0.1, 0, 0, 0]\n"
+    out = tmp_path / "out"
+    command = ["convert", str(rectified(mine, camera=True)), str(out), "-q"]
+    for words in (["--stereo", "wide"], ["--stereo", "-0.1"], ["--stereo"]):
+        assert main([*command, *words]) == 2
+    assert main([*command, "--stereo", "0.1"]) == 0
+    assert open_sequence(out)[0].depth.max() > 0
+    capsys.readouterr()
+    # a sequence with depth of its own
+    assert main(["convert", str(out), str(tmp_path / "b"), "--stereo"]) == 2
+    assert "with depth of its own" in capsys.readouterr().err
+    bent = (mine / "camera.yaml").read_text() + "distortion: [0.1, 0, 0, 0]\n"
     (mine / "camera.yaml").write_text(bent)
     with pytest.raises(InputError, match="the camera has distortion"):
         open_sequence(mine, stereo=0.1)
-    for wrong in ("wide", 0, -1.0):
-        with pytest.raises(InputError, match="stereo"):
-            open_sequence(mine, stereo=wrong)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo import Camera, InputError, open_sequence
+from hybridvo import InputError, open_sequence
 from hybridvo.core.errors import FormatError
 from hybridvo.run.cli import main
 
@@ -77,10 +77,6 @@ def test_a_video_with_depth_in_another_folder(tmp_path: Path) -> None:
     command = ["run", str(video), *depth, "--out", str(out), "-q"]
     assert main([*command, "--method", "identity"]) == 0
     assert len((out / "trajectory.tum").read_text().splitlines()) == N
-    # the camera is the smaller of two obstacles
-    (root / "camera.yaml").unlink()
-    with pytest.raises(InputError, match="a video has no depth"):
-        open_sequence(video)
 
 
 def test_depth_of_some_frames_is_matched_by_number_or_time(tmp_path: Path) -> None:
@@ -129,13 +125,6 @@ def test_what_is_missing_or_of_another_size(tmp_path: Path) -> None:
         open_sequence(root)
 
 
-def test_a_file_that_is_no_video(tmp_path: Path, capfd) -> None:
-    root = recording(tmp_path)
-    (root / "color.mp4").write_bytes(b"no video at all")
-    with pytest.raises(FormatError, match="OpenCV cannot decode"):
-        open_sequence(root)
-
-
 # -- Stray Scanner ---------------------------------------------------------------------------------
 
 
@@ -173,13 +162,6 @@ def test_a_recording_of_stray_scanner(tmp_path: Path) -> None:
     assert frame.rgb.shape == (48, 64, 3)
     assert (frame.depth[:, :8] == 0).all()  # of no confidence
     np.testing.assert_allclose(frame.depth[:, 8:], 1.1)
-
-
-def test_a_phone_with_a_rolling_shutter(tmp_path: Path) -> None:
-    root = stray(tmp_path)
-    # of the video, which is read at a fifth of its size
-    camera = Camera(300, 300, 159.5, 119.5, 240, 320, readout_ms=25)
-    assert open_sequence(root, camera=camera).camera(0).readout_ms == 25
 
 
 def test_a_damaged_list_of_stray_scanner(tmp_path: Path) -> None:
