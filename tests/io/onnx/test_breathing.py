@@ -11,18 +11,12 @@ import pytest
 from hybridvo import Frame, Odometry
 from hybridvo.core.geometry import chain, invert, se3_exp
 from hybridvo.core.options import DepthOptions, Options
-from hybridvo.core.results import Reason, RelativePose, Step
+from hybridvo.core.results import RelativePose, Step
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.tracking.calibration import (
-    DEPTH_SCALE_DRIFT,
-    DEPTH_SCALE_STD,
-)
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
-    divided,
     in_one_scale,
     measured_scale,
-    rescaled_about,
     scale_factors,
 )
 from tests.worlds import world
@@ -50,43 +44,6 @@ def test_the_ratio_of_two_depth_maps() -> None:
     assert measured_scale(pair.prev, larger, motion) == pytest.approx(
         1.07, abs=2e-3
     )
-
-
-def test_nothing_is_measured_where_nothing_is_known() -> None:
-    pair, T = world()
-    failed = RelativePose.failed(Reason.NO_FLOW, "none")
-    assert measured_scale(pair.prev, pair.curr, failed) is None
-    blind = replace(pair.curr, depth=None)
-    assert measured_scale(pair.prev, blind, RelativePose(T_curr_prev=T)) is None
-
-
-def test_the_filter_is_a_mean_where_ratios_are_exact(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("hybridvo.tracking.depth_scale.DEPTH_SCALE_DRIFT", 0.0)
-    known = ScaleFilter()
-    for n in range(2, 6):
-        assert known.gain == pytest.approx(1 / n)
-        known = known.observed()
-
-
-def test_the_filter_forgets() -> None:
-    known = ScaleFilter()
-    for _ in range(1000):
-        known = known.observed()
-    # with drift q and noise r the steady variance p is that of p^2 = q^2 (p + r^2)
-    q2 = DEPTH_SCALE_DRIFT**2
-    r2 = DEPTH_SCALE_STD**2
-    assert known.variance**2 == pytest.approx(q2 * (known.variance + r2), rel=1e-6)
-
-
-def test_space_grows_around_the_camera() -> None:
-    here = se3_exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
-    T_here_there = se3_exp(np.array([0.5, 0.0, 0.1, 0.0, 0.3, 0.0]))
-    there = rescaled_about(here @ T_here_there, here, 2.0)
-    expected = T_here_there.copy()
-    expected[:3, 3] *= 2
-    np.testing.assert_allclose(invert(here) @ there, expected, atol=1e-12)
 
 
 def test_a_path_in_one_scale() -> None:
@@ -137,22 +94,6 @@ def test_a_chain_of_ratios_that_err_to_one_side_does_not_bend_the_path(
     thirds = [np.mean(part) for part in np.array_split(path_scale, 3)]
     assert np.ptp(thirds) < 0.015
     assert np.mean(path_scale) == pytest.approx(1, abs=0.01)
-
-
-def test_a_frame_that_is_lost_tells_nothing_of_those_before() -> None:
-    scales = np.array([1.0, 1.1, 1.0, 1.3, 1.2])
-    changes = np.array([1.0, 1.02, 1.0, 1.1, 1.05])
-    factors = scale_factors(scales, changes)
-    alone = scale_factors(scales[:2], changes[:2])
-    np.testing.assert_allclose(factors[:2], alone)
-    assert factors[2] > 1.05
-
-
-def test_divided_depth_states_its_divisor() -> None:
-    pair, _ = world()
-    twice = divided(divided(pair.prev, 2.0), 4.0)
-    assert twice.depth_scale == 8.0
-    np.testing.assert_allclose(twice.depth, pair.prev.depth / 8, rtol=1e-6)
 
 
 # -- a tracked path ----------------------------------------------------------------------
@@ -235,13 +176,6 @@ def test_a_path_of_breathing_depth_has_one_scale(
         return float(np.linalg.norm(scaled - steady.path[:, :3, 3]))
 
     assert error(on.path) < 0.4 * error(off.path)
-
-
-@pytest.mark.slow
-def test_true_depth_stays_as_it_is(walk: list, steady: Tracked) -> None:
-    found = tracked(walk, np.ones(FRAMES), "on")
-    assert similarity_scale(found.path, steady.path) == pytest.approx(1, abs=3e-3)
-    assert np.std([step.depth_scale for step in found.steps]) < 5e-3
 
 
 def test_auto_scales_depth_of_a_network_alone(walk: list) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from hybridvo import InputError, open_sequence
-from hybridvo.core.options import Options
 from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run import restored, saved
@@ -69,24 +68,6 @@ def test_a_video_needs_depth_or_a_network(video: Path, tmp_path: Path) -> None:
     assert sequence.opened_with()["networks"] == {"depth": "wall.onnx"}
 
 
-def test_a_folder_of_images_needs_none(video: Path, tmp_path: Path) -> None:
-    root = tmp_path / "images"
-    (root / "rgb").mkdir(parents=True)
-    (root / "camera.yaml").write_text(CAMERA)
-    capture = cv2.VideoCapture(str(video / "walk.avi"))
-    for i in range(FRAMES):
-        cv2.imwrite(str(root / "rgb" / f"{i:06d}.png"), capture.read()[1])
-    sequence = open_sequence(root, depth=wall_network(tmp_path))
-    assert (sequence.kind, len(sequence)) == ("folder", FRAMES)
-    assert sequence[0].depth is not None
-
-
-@pytest.mark.parametrize("depth", ["wall.onnx", 3, "onnx"])
-def test_a_depth_that_is_no_network(depth: object, video: Path) -> None:
-    with pytest.raises(InputError, match="expected 'onnx:FILE'"):
-        open_sequence(video, depth=depth)
-
-
 def test_run_with_networks_for_everything(video: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     flow = flow_network(tmp_path / "flow.onnx", -2.0, 0.0, SIZE)
@@ -127,17 +108,12 @@ def test_a_network_that_is_missing_is_one_line(
 ) -> None:
     assert main(["run", str(video), "--depth", "onnx:no.onnx"]) == 2
     assert "expected an ONNX file, got no such file" in capsys.readouterr().err
+    for wrong in ("wall.onnx", "onnx"):
+        assert main(["run", str(video), "--depth", wrong]) == 2
+        assert "onnx:FILE" in capsys.readouterr().err
     text = wall_network(tmp_path)
     assert main(["run", str(video), "--depth", text, "--flow", "onnx:no.onnx"]) == 2
     assert "--flow onnx:no.onnx" in capsys.readouterr().err
-
-
-def test_options_take_networks() -> None:
-    assert Options(flow={"source": "onnx:a.onnx"}).flow.source == "onnx:a.onnx"
-    with pytest.raises(InputError, match="expected auto or onnx:FILE"):
-        Options(depth={"source": "sensor"})
-    with pytest.raises(InputError, match="expected auto, file, dis or onnx:FILE"):
-        Options(flow={"source": "onnx:"})
 
 
 def test_live_frames_go_through_the_networks(video: Path, tmp_path: Path) -> None:

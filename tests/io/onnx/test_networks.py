@@ -17,7 +17,7 @@ from hybridvo.io.onnx import session as sessions
 from hybridvo.io.onnx.depth import DepthNetwork
 from hybridvo.io.onnx.description import description_names, read_description
 from hybridvo.io.onnx.flow import FlowNetwork
-from hybridvo.io.onnx.images import place, tensor
+from hybridvo.io.onnx.images import place
 from hybridvo.io.onnx.mask import MaskNetwork
 from tests.io.onnx.graphs import (
     constant_network,
@@ -69,56 +69,13 @@ def test_depth_is_in_metres(text: str, expected: float, tmp_path: Path) -> None:
     np.testing.assert_allclose(depth, expected, rtol=1e-6)
 
 
-def test_each_pixel_keeps_its_depth(tmp_path: Path) -> None:
-    rgb = colours()
-    depth = predicted(depth_network(tmp_path / "a.onnx"), DEPTH, rgb)
-    np.testing.assert_allclose(depth, rgb.mean(2), rtol=1e-5)
-
-
-@pytest.mark.parametrize(("channels", "first"), [("rgb", 10.0), ("bgr", 30.0)])
-def test_the_order_of_channels(channels: str, first: float, tmp_path: Path) -> None:
-    what = read_description(
-        _written(tmp_path, f"{DEPTH}channels: {channels}\n"), "depth"
-    )
-    rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    rgb[:] = (10, 20, 30)
-    made = tensor(rgb, place(rgb.shape[:2], what, None), what)
-    assert made.shape == (1, 3, HEIGHT, WIDTH)
-    assert (made[0, 0] == first).all()
-
-
 def _written(folder: Path, text: str) -> Path:
     path = folder / "what.yaml"
     path.write_text(text)
     return path
 
 
-@pytest.mark.parametrize(
-    ("layout", "shape"),
-    [
-        ("nchw", (1, 3, HEIGHT, WIDTH)),
-        ("nhwc", (1, HEIGHT, WIDTH, 3)),
-        ("nvchw", (1, 1, 3, HEIGHT, WIDTH)),
-    ],
-)
-def test_the_layout(layout: str, shape: tuple[int, ...], tmp_path: Path) -> None:
-    what = read_description(
-        _written(tmp_path, f"{DEPTH}layout: {layout}\n"), "depth"
-    )
-    made = tensor(colours(), place((HEIGHT, WIDTH), what, None), what)
-    assert made.shape == shape
-
-
 # -- sizes -------------------------------------------------------------------------------
-
-
-def test_a_canonical_focal_length_is_that_of_the_resized_image(
-    tmp_path: Path,
-) -> None:
-    # twice the size: 40 px instead of 20 px, so twice the depth
-    model = depth_network(tmp_path / "a.onnx", size=(24, 32))
-    depth = predicted(model, f"{DEPTH}canonical_focal: 20\n", grey(40))
-    np.testing.assert_allclose(depth, 80.0, rtol=1e-6)
 
 
 def test_padding_is_cut_off_again(tmp_path: Path) -> None:
@@ -130,13 +87,6 @@ def test_padding_is_cut_off_again(tmp_path: Path) -> None:
     # enlarged and made smaller again, a ramp stays what it was inside
     np.testing.assert_allclose(depth[:, 1:-1], ramp[:, 1:-1, 0], rtol=1e-5)
     assert depth.max() < 200
-
-
-def test_free_sizes_are_whole_multiples(tmp_path: Path) -> None:
-    what = read_description(
-        _written(tmp_path, f"{DEPTH}longest: 70\nmultiple_of: 14\n"), "depth"
-    )
-    assert place((480, 640), what, None).network == (56, 70)
 
 
 def test_the_camera_of_a_resized_image_sees_the_same_rays(tmp_path: Path) -> None:
@@ -238,13 +188,6 @@ def test_flow_that_differs_backward_is_not_valid(tmp_path: Path) -> None:
     assert not FlowNetwork(describe(wrong, FLOW))(prev, curr).valid.any()
 
 
-def test_no_flow_without_images(tmp_path: Path) -> None:
-    model = flow_network(tmp_path / "a.onnx", 1.0, 1.0)
-    network = FlowNetwork(describe(model, FLOW))
-    frame = Frame(None, np.ones((HEIGHT, WIDTH)), CAMERA)
-    assert network(frame, frame).flow is None
-
-
 # -- masks -------------------------------------------------------------------------------
 
 
@@ -260,16 +203,6 @@ def test_people_are_masked(tmp_path: Path) -> None:
     expected[3:7, 4:9] = False
     np.testing.assert_array_equal(frame.mask, expected)
     np.testing.assert_array_equal(np.isfinite(frame.depth), expected)
-
-
-def test_a_mask_of_one_channel_has_a_threshold(tmp_path: Path) -> None:
-    model = depth_network(tmp_path / "a.onnx")
-    network = MaskNetwork(describe(model, "task: mask\nthreshold: 100\n"))
-    rgb = grey(90)
-    rgb[:, :5] = 110
-    found = network.predict(rgb, CAMERA)
-    assert found[:, :5].all()
-    assert not found[:, 5:].any()
 
 
 # -- what is wrong -----------------------------------------------------------------------
@@ -303,27 +236,11 @@ def test_holes_stay_holes(tmp_path: Path) -> None:
     assert (found[rows, columns] == 0).all()
 
 
-def test_flow_that_is_not_finite_has_no_value(tmp_path: Path) -> None:
-    flow = np.full((1, 2, HEIGHT, WIDTH), 1.0)
-    flow[0, 0, 2, 3] = np.inf
-    model = constant_network(
-        tmp_path / "a.onnx",
-        {"flow": flow},
-        {"image": (1, 3, HEIGHT, WIDTH), "second": (1, 3, HEIGHT, WIDTH)},
-    )
-    found = FlowNetwork(describe(model, FLOW)).predict(colours(), colours(), CAMERA)
-    assert np.isnan(found[2, 3, 0])
-    assert np.count_nonzero(np.isnan(found)) == 1
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("onnx:missing.onnx", "expected an ONNX file, got no such file"),
-        (
-            "onnx:{model}",
-            "no description of the network: expected a.yaml beside it",
-        ),
+        ("onnx:missing.onnx", "no such file"),
+        ("onnx:{model}", "no description of the network"),
         ("onnx:{model}@no_such_name", "one of da3_metric, metric3d_small"),
         ("onnx:{model}@neuflow_v2", "a network for flow: expected one for depth"),
     ],
@@ -337,12 +254,12 @@ def test_files_that_are_missing(text: str, message: str, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("output: metres\n", "has no output 'metres' as .* states: it has depth"),
-        ("inputs: [rgb]\n", "has no input 'rgb' as .* states: it has image"),
-        ("factor_output: [a, b]\n", "has no output 'a'"),
-        ("size: [20, 20]\n", "does not take image float32 .1, 3, 20, 20."),
-        ("layout: nhwc\nsize: [12, 16]\n", "Compare 'inputs', 'size', 'layout'"),
-        ("channel: 2\n", "has 1 channels, and .* requests channel 2"),
+        ("output: metres\n", "no output 'metres'"),
+        ("inputs: [rgb]\n", "no input 'rgb'"),
+        ("size: [20, 20]\n", "does not take image"),
+        ("layout: nhwc\nsize: [12, 16]\n", "'layout'"),
+        ("channel: 2\n", "requests channel 2"),
+        ("recover_shift: true\n", "3 channels"),
     ],
 )
 def test_a_description_that_does_not_fit(
@@ -370,13 +287,7 @@ def test_a_damaged_description(text: str, message: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "size: [65536, 65536]",
-        "size: [1000000000, 1000000000]",
-        "longest: 100000",
-        "multiple_of: 1000000",
-    ],
+    "text", ["size: [65536, 65536]", "longest: 100000", "multiple_of: 1000000"]
 )
 def test_images_of_a_network_have_a_limit(text: str, tmp_path: Path) -> None:
     model = depth_network(tmp_path / "a.onnx")
@@ -394,27 +305,11 @@ def test_sizes_that_a_file_states_have_a_limit(side: int, tmp_path: Path) -> Non
         DepthNetwork(f"onnx:{model}")
 
 
-def test_points_of_one_channel_have_no_shift(tmp_path: Path) -> None:
-    model = depth_network(tmp_path / "a.onnx")
-    describe(model, "task: depth\nrecover_shift: true\n")
-    with pytest.raises(InputError, match="expected points of 3 channels"):
-        DepthNetwork(f"onnx:{model}").predict(grey(7), CAMERA)
-
-
 def test_a_damaged_file(tmp_path: Path) -> None:
     model = tmp_path / "a.onnx"
     model.write_bytes(b"no protocol buffer")
     with pytest.raises(FormatError, match=r"a\.onnx"):
         DepthNetwork(describe(model, DEPTH))
-
-
-def test_flow_of_another_number_of_channels(tmp_path: Path) -> None:
-    size = (1, 3, HEIGHT, WIDTH)
-    outputs = {"flow": np.zeros(size)}
-    inputs = {"image": size, "second": size}
-    model = constant_network(tmp_path / "a.onnx", outputs, inputs)
-    with pytest.raises(InputError, match="flow has 3 channels: expected 2"):
-        FlowNetwork(describe(model, FLOW)).predict(colours(), colours(), CAMERA)
 
 
 # -- without onnxruntime -----------------------------------------------------------------
@@ -442,32 +337,6 @@ def test_opencv_stands_in(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> N
     assert "pip install 'hybridvo[onnx]'; OpenCV runs it" in caplog.text
 
 
-@pytest.mark.usefixtures("without_runtime")
-def test_opencv_runs_a_network_of_two_images(tmp_path: Path) -> None:
-    model = flow_network(tmp_path / "a.onnx", 3.0, -2.0, (HEIGHT, WIDTH))
-    text = (
-        f"{FLOW}size: [12, 16]\ninputs: [first, second]\nboth_directions: false\n"
-    )
-    flow = FlowNetwork(describe(model, text)).predict(colours(), colours(1), CAMERA)
-    np.testing.assert_allclose(flow[5, 5], (3.0, -2.0), rtol=1e-6)
-    with pytest.raises(
-        InputError, match="takes 2 images: expected 'inputs' with 2"
-    ):
-        FlowNetwork(describe(model, f"{FLOW}size: [12, 16]\n")).predict(
-            colours(), colours(1), CAMERA
-        )
-
-
-@pytest.mark.usefixtures("without_runtime")
-def test_the_extra_is_named_where_opencv_cannot(tmp_path: Path) -> None:
-    model = tmp_path / "a.onnx"
-    model.write_bytes(b"no protocol buffer")
-    with pytest.raises(
-        InputError, match=r"pip install 'hybridvo\[onnx\]'\. OpenCV"
-    ):
-        DepthNetwork(describe(model, DEPTH))
-
-
 def test_a_frame_states_that_its_depth_is_predicted(tmp_path: Path) -> None:
     model = depth_network(tmp_path / "a.onnx", 0.05)
     measured = Frame(grey(40), np.ones((HEIGHT, WIDTH)), CAMERA, index=3)
@@ -476,3 +345,12 @@ def test_a_frame_states_that_its_depth_is_predicted(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.depth, 2.0)
     bare = replace(measured, rgb=None)
     assert DepthNetwork(describe(model, DEPTH))(bare).depth is None
+
+
+def test_flow_of_another_number_of_channels(tmp_path: Path) -> None:
+    size = (1, 3, HEIGHT, WIDTH)
+    outputs = {"flow": np.zeros(size)}
+    inputs = {"image": size, "second": size}
+    model = constant_network(tmp_path / "a.onnx", outputs, inputs)
+    with pytest.raises(InputError, match="flow has 3 channels: expected 2"):
+        FlowNetwork(describe(model, FLOW)).predict(colours(), colours(), CAMERA)

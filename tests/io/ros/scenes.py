@@ -98,3 +98,12 @@ def write(root: Path, kind: str, drawn: Scene, *, imu: bool = False) -> Path:
     if imu:
         write_imu(writer, drawn)
     return writer.close()
+
+
+def pose(message: Any) -> np.ndarray:
+    inner = message.pose.pose
+    q = inner.orientation
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    T[:3, 3] = inner.position.x, inner.position.y, inner.position.z
+    return T

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -110,24 +108,6 @@ def test_frames_that_one_of_them_lacks_are_a_difference(
     assert "3 published poses are of no frame of the run" in str(found)
 
 
-def test_another_bag_is_an_error(tmp_path: Path, path: Trajectory) -> None:
-    later = Trajectory(path.timestamps + 5, path.T_world_cam)
-    messages = recorded_odometry(heard(tmp_path, path), "/odom")
-    with pytest.raises(
-        hvo.InputError, match="expected poses with the stamps of the 6"
-    ):
-        difference(messages, later)
-
-
-def test_a_topic_that_is_not_there_is_an_error(bag: Path) -> None:
-    with pytest.raises(
-        hvo.InputError, match=r"on /vo, got no such topic; .*: none"
-    ):
-        recorded_odometry(bag, "/vo")
-    with pytest.raises(hvo.InputError, match="got sensor_msgs/msg/Image"):
-        recorded_odometry(bag, bags.RGB)
-
-
 def test_the_node_gets_what_the_run_uses(bag: Path, tmp_path: Path) -> None:
     used = used_topics(bag)
     assert used == (bags.RGB, bags.DEPTH, bags.INFO, scenes.IMU, scenes.FRAMES)
@@ -177,111 +157,3 @@ def test_the_program_compares_a_recording(
     given = [str(bag), "--heard", str(recording), "--out", str(tmp_path / "out")]
     assert program.main([*given, "--set", METHOD]) == code
     assert "6 poses compared: largest difference" in capsys.readouterr().out
-
-
-def test_without_ros_the_program_says_what_it_needs(
-    bag: Path,
-    tmp_path: Path,
-    program: ModuleType,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "rclpy", None)
-    given = [str(bag), "--out", str(tmp_path / "out"), "--set", METHOD]
-    assert program.main(given) == 2
-    said = capsys.readouterr().err
-    assert "ROS 2 is needed to play a bag, and is not there; --heard" in said
-    # at once, before anything was tracked
-    assert not (tmp_path / "out").exists()
-
-
-class Programs:
-    """What the program starts; a node publishes once a bag is played."""
-
-    def __init__(self, messages: list[Any]) -> None:
-        self.commands = list[list[str]]()
-        self.stopped = list[int]()
-        self._messages = messages
-        self._hear: Any = None
-        self._codes = dict[int, int]()
-
-    def start(self, command: list[str]) -> SimpleNamespace:
-        number = len(self.commands)
-        self.commands.append(command)
-        return SimpleNamespace(
-            poll=lambda: self._codes.get(number),
-            send_signal=lambda signal: self.stopped.append(number),
-            wait=lambda seconds: 0,
-        )
-
-    def end(self, number: int, code: int) -> None:
-        self._codes[number] = code
-
-    def install(self, monkeypatch: pytest.MonkeyPatch, program: ModuleType) -> None:
-        def spin_once(listener: Any, timeout_sec: float) -> None:
-            if len(self.commands) == 2 and self._messages:
-                self._hear(self._messages.pop(0))
-
-        def listen(kind: Any, topic: str, callback: Any, depth: int) -> None:
-            assert topic == "/odom"
-            self._hear = callback
-
-        listener = SimpleNamespace(
-            create_subscription=listen,
-            count_subscribers=lambda topic: len(self.commands),
-            destroy_node=lambda: None,
-        )
-        rclpy = SimpleNamespace(
-            init=lambda: None,
-            try_shutdown=lambda: None,
-            create_node=lambda name: listener,
-            spin_once=spin_once,
-        )
-        monkeypatch.setitem(sys.modules, "rclpy", rclpy)
-        messages = SimpleNamespace(Odometry=object)
-        monkeypatch.setitem(sys.modules, "nav_msgs", ModuleType("nav_msgs"))
-        monkeypatch.setitem(sys.modules, "nav_msgs.msg", messages)
-        monkeypatch.setattr(program, "start", self.start)
-
-
-def test_the_program_plays_the_bag_to_the_node(
-    bag: Path,
-    path: Trajectory,
-    tmp_path: Path,
-    program: ModuleType,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    messages = recorded_odometry(heard(tmp_path, path), "/odom")
-    programs = Programs(messages)
-    programs.install(monkeypatch, program)
-    used = used_topics(bag)
-    parameters = node_parameters(used)
-    found = program.played(bag, used, parameters, tmp_path, "/odom")
-    assert difference(found, path).is_within(1e-6, 1e-4)
-    node, play = programs.commands
-    assert node[:3] == [sys.executable, "-m", "hybridvo_ros.odometry"]
-    assert f"topic_rgb:={bags.RGB}" in node and node.count("-p") == len(parameters)
-    assert play[:4] == ["ros2", "bag", "play", str(bag)]
-    topics = play[play.index("--topics") + 1 :]
-    assert topics == [bags.RGB, bags.DEPTH, bags.INFO, scenes.IMU, "/tf_static"]
-    qos = Path(play[play.index("--qos-profile-overrides-path") + 1])
-    assert yaml.safe_load(qos.read_text(encoding="utf-8")) == play_qos(used)
-    # the player first
-    assert programs.stopped == [1, 0]
-
-
-@pytest.mark.parametrize(("number", "name"), [(0, "node"), (1, "player")])
-def test_a_program_that_fails_ends_the_comparison(
-    bag: Path,
-    tmp_path: Path,
-    program: ModuleType,
-    monkeypatch: pytest.MonkeyPatch,
-    number: int,
-    name: str,
-) -> None:
-    programs = Programs([])
-    programs.end(number, 2)
-    programs.install(monkeypatch, program)
-    used = used_topics(bag)
-    with pytest.raises(hvo.InputError, match=f"the {name} ended with code 2"):
-        program.played(bag, used, node_parameters(used), tmp_path, "/odom")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.io.ros.conversions import optical_mount
 from hybridvo.io.ros.follower import Follower
 from hybridvo.io.ros.inbox import Arrived, Inbox
 from hybridvo.io.ros.parameters import NodeOptions
@@ -78,27 +77,6 @@ def test_samples_of_a_frame_that_had_to_go_come_with_the_next_one() -> None:
     assert stamps(last) == [10.05, 10.15]
 
 
-def test_accelerations_are_kept_where_there_are_some() -> None:
-    inbox = inbox_of([])
-    message = sample(10.0)
-    message.linear_acceleration.z = 9.8
-    inbox.add_imu(message)
-    inbox.add_images(pair(10.1), None)
-    (frame,) = taken_from(inbox)
-    assert frame.imu is not None and frame.imu.accelerations is not None
-    assert frame.imu.accelerations.tolist() == [[0, 0, 9.8]]
-
-
-def test_a_frame_waits_until_the_samples_reach_it() -> None:
-    inbox = inbox_of([])
-    inbox.add_images(pair(10.0), None)
-    inbox.add_imu(sample(9.99))
-    assert inbox._next() is None
-    inbox.add_imu(sample(10.0))
-    frame = inbox.take()
-    assert frame is not None and stamps(frame) == [9.99]
-
-
 def test_a_frame_does_not_wait_long_and_the_next_ones_not_at_all() -> None:
     said = list[str]()
     inbox = inbox_of(said, patience_s=0.0)
@@ -144,15 +122,6 @@ def test_samples_that_come_late_or_twice_are_left_out() -> None:
     assert stamps(frame) == [10.0, 10.01, 10.02]
 
 
-def test_a_bag_that_is_played_again_begins_anew() -> None:
-    inbox = inbox_of([])
-    for seconds in (10.0, 10.01, 5.0, 5.01):
-        inbox.add_imu(sample(seconds))
-    inbox.add_images(pair(5.02), None)
-    (frame,) = taken_from(inbox)
-    assert stamps(frame) == [5.0, 5.01]
-
-
 def test_the_rotation_is_that_of_the_static_transforms() -> None:
     inbox = inbox_of([])
     message = fixed("gyro", "optical")
@@ -167,26 +136,6 @@ def test_the_rotation_is_that_of_the_static_transforms() -> None:
     np.testing.assert_allclose(
         frame.imu.R_cam_imu @ [1, 0, 0], [0, -1, 0], atol=1e-12
     )
-
-
-def test_an_accelerometer_is_not_taken_for_a_gyroscope() -> None:
-    said = list[str]()
-    inbox = inbox_of(said, patience_s=0.0)
-    for k in range(3):
-        message = sample(10.0 + k)
-        message.angular_velocity_covariance[0] = -1
-        inbox.add_imu(message)
-    inbox.add_images(pair(10.5), None)
-    assert inbox.take() is not None
-    assert said[0] == "/imu states that it has no rates: not used"
-
-
-def test_nothing_is_kept_where_no_gyroscope_is_wanted() -> None:
-    inbox = Inbox(NodeOptions(), print)
-    inbox.add_info("info")
-    inbox.add_images(pair(10.0), None)
-    frame = inbox.take()
-    assert frame is not None and frame.imu is None
 
 
 # -- the tracker -------------------------------------------------------------------------
@@ -225,25 +174,22 @@ def test_samples_of_a_frame_that_cannot_be_used_go_to_the_next_one() -> None:
     assert tracker.state.gyroscope is not None
 
 
-def test_without_a_gyroscope_the_tracker_is_given_none() -> None:
-    tracker = hvo.Odometry(None)
-    follow(
-        Follower(tracker, NodeOptions(), print), arrived(0, 1.0), arrived(1, 1.1)
-    )
-    assert tracker.state.gyroscope is None
-
-
-def test_a_reset_forgets_the_path_and_what_was_measured() -> None:
+def test_an_accelerometer_is_not_taken_for_a_gyroscope() -> None:
     said = list[str]()
-    tracker = hvo.Odometry(None)
-    follower = Follower(tracker, NodeOptions(), said.append)
-    before = follow(follower, arrived(0, 10.0), arrived(3, 10.1))[-1]
-    follower.ask_for_reset()
-    first, second = follow(follower, arrived(3, 10.2), arrived(4, 10.3))
-    np.testing.assert_array_equal(
-        first.T_odom_child, optical_mount("optical").T_odom_world
-    )
-    assert first.step.prev_index is None and second.step.ok
-    assert first.covariance[0, 0] < before.covariance[0, 0]
-    assert [first.restarts, second.restarts] == [1, 1]
-    assert said == ["reset: tracking begins anew at the origin"]
+    inbox = inbox_of(said, patience_s=0.0)
+    for k in range(3):
+        message = sample(10.0 + k)
+        message.angular_velocity_covariance[0] = -1
+        inbox.add_imu(message)
+    inbox.add_images(pair(10.5), None)
+    assert inbox.take() is not None
+    assert said[0] == "/imu states that it has no rates: not used"
+
+
+def test_a_bag_that_is_played_again_begins_anew() -> None:
+    inbox = inbox_of([])
+    for seconds in (10.0, 10.01, 5.0, 5.01):
+        inbox.add_imu(sample(seconds))
+    inbox.add_images(pair(5.02), None)
+    (frame,) = taken_from(inbox)
+    assert stamps(frame) == [5.0, 5.01]

@@ -204,15 +204,6 @@ def run(bag: Path, out: Path, *options: str) -> tuple[np.ndarray, list[dict]]:
     return read_trajectory(out / "trajectory.tum").T_world_cam, rows
 
 
-def pose(message: Any) -> np.ndarray:
-    inner = message.pose.pose
-    T = np.eye(4)
-    q = inner.orientation
-    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = inner.position.x, inner.position.y, inner.position.z
-    return T
-
-
 def values(array: Any) -> dict[str, str]:
     (status,) = array.status
     return {value.key: value.value for value in status.values}
@@ -243,7 +234,7 @@ def test_a_played_bag_gives_what_run_writes(ros: Ros, tmp_path: Path) -> None:
         assert stamp.sec * 10**9 + stamp.nanosec == bags.stamp(i)
         # the text of a pose has 17 digits
         T = mount @ expected[i] @ invert(mount)
-        np.testing.assert_allclose(pose(message), T, atol=1e-12)
+        np.testing.assert_allclose(scenes.pose(message), T, atol=1e-12)
         covariance = message.pose.covariance.reshape(6, 6)
         assert np.linalg.eigvalsh(covariance)[0] > 0
         said = values(found["/diagnostics"][i])
@@ -260,7 +251,7 @@ def test_a_played_bag_gives_what_run_writes(ros: Ros, tmp_path: Path) -> None:
     seconds = (bags.stamp(2) - bags.stamp(1)) / 1e9
     twist = b.twist.twist
     angular = np.array([twist.angular.x, twist.angular.y, twist.angular.z])
-    turned = pose(a)[:3, :3].T @ pose(b)[:3, :3]
+    turned = scenes.pose(a)[:3, :3].T @ scenes.pose(b)[:3, :3]
     np.testing.assert_allclose(
         Rotation.from_matrix(turned).as_rotvec(), seconds * angular, atol=1e-9
     )
@@ -280,7 +271,7 @@ def test_a_gyroscope_a_path_and_a_reset(ros: Ros, tmp_path: Path) -> None:
     for message, T, said in zip(
         found["/odom"], expected, found["/diagnostics"], strict=True
     ):
-        np.testing.assert_allclose(pose(message), BODY @ T, atol=1e-12)
+        np.testing.assert_allclose(scenes.pose(message), BODY @ T, atol=1e-12)
         assert values(said)["restarts"] == "1"
     paths = found["/hybridvo/path"]
     assert [len(path.poses) for path in paths] == [1, 2, 3, 4, 5, 6]
@@ -321,12 +312,6 @@ def test_a_real_recording_by_the_launch_file(
     for message, T, row, said in zip(
         found["/odom"], expected, rows, found["/diagnostics"], strict=True
     ):
-        np.testing.assert_allclose(pose(message), BODY @ T, atol=1e-12)
+        np.testing.assert_allclose(scenes.pose(message), BODY @ T, atol=1e-12)
         assert message.child_frame_id == "camera_color_optical_frame"
         assert values(said)["status"] == row["status"]
-
-
-def test_a_parameter_that_is_not_known_ends_the_node(ros: Ros) -> None:
-    node = ros.start(sys.executable, str(NODE), "_bas_frame:=x")
-    assert node.wait(LONG_S) == 2
-    assert "parameter bas_frame: expected one of base_frame" in ros.logs()
