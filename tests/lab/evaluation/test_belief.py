@@ -65,10 +65,6 @@ def test_what_is_wrong_and_called_ok_is_counted() -> None:
     assert row["beyond_share"] == pytest.approx(1 / 3)
 
 
-def test_without_ground_truth_there_is_no_line() -> None:
-    assert belief_rows(pair_table([pair(error=np.nan)])) == []
-
-
 def test_probabilities_are_held_against_how_often_they_are_right() -> None:
     pairs = pair_table(
         [pair(probability=0.97, error=e) for e in (0.1, 0.2, 0.1, 5.0)]
@@ -78,22 +74,3 @@ def test_probabilities_are_held_against_how_often_they_are_right() -> None:
     assert rows["probability"].tolist() == pytest.approx([0.5, 0.97])
     assert rows["right"].tolist() == [0.5, 0.75]
     assert rows["motions"].tolist() == [2, 4]
-
-
-def test_the_report_draws_them() -> None:
-    pytest.importorskip("plotly", reason="plotly is not installed (extra report)")
-    from hybridvo.lab.evaluation.charts import belief_charts
-
-    pairs = pair_table(
-        [
-            pair(nees=4.0 + k, probability=0.99, sigma_trans=0.01, trans_err=0.02)
-            for k in range(4)
-        ]
-    )
-    totals = [{"flow_source": "dis"}]
-    charts = belief_charts(totals, pairs, ["hybrid"])
-    assert len(charts) == 3
-    assert "true covariance" in charts[0]
-    assert "3 sigma" in charts[1]
-    assert "true probability" in charts[2]
-    assert belief_charts([], pair_table([]), ["hybrid"]) == []

@@ -173,17 +173,9 @@ def test_one_and_two_poses(frames):
     report = evaluate(trajectory, trajectory)
     assert report["ate_rmse"] is None
     assert "not enough poses" in report["reasons"]["ate_rmse"]
-    assert report["ate_rmse_unaligned"] == 0.0
-    assert report["ate_rmse_origin"] == 0.0
-    if frames == 1:
-        assert report["rpe_trans_rmse"] is None
-        assert "not enough poses" in report["reasons"]["rpe_trans_rmse"]
-    else:
-        assert report["rpe_trans_rmse"] == 0.0
-    assert (
-        report["kitti_drift"] is None
-        and "shorter than" in report["reasons"]["kitti_drift"]
-    )
+    assert report["ate_rmse_unaligned"] == report["ate_rmse_origin"] == 0.0
+    assert report["rpe_trans_rmse"] == (None if frames == 1 else 0.0)
+    assert "shorter than" in report["reasons"]["kitti_drift"]
     json.dumps(report, allow_nan=False)
 
 
@@ -191,8 +183,7 @@ def test_few_matches_give_no_number():
     positions = np.random.default_rng(4).normal(size=(50, 3))
     truth = from_positions(positions)
     # nanoseconds read as seconds elsewhere: one stamp of fifty meets
-    est = from_positions(positions, truth.timestamps * 1000)
-    report = evaluate(est, truth)
+    report = evaluate(from_positions(positions, truth.timestamps * 1000), truth)
     assert (report["matched"], report["total"]) == (1, 50)
     for key in (
         "ate_rmse",
@@ -203,8 +194,7 @@ def test_few_matches_give_no_number():
         assert report[key] is None
         assert "only 1 of 50 poses match" in report["reasons"][key]
     nothing = evaluate(from_positions(positions, truth.timestamps + 1e6), truth)
-    assert nothing["matched"] == 0
-    assert "only 0 of 50" in nothing["reasons"]["ate_rmse"]
+    assert nothing["matched"] == 0 and nothing["ate_rmse"] is None
 
 
 # -- association ----------------------------------------------------------------------------------
@@ -254,19 +244,14 @@ PATH = from_positions(np.eye(3))
     ("arguments", "options", "field"),
     [
         ((PATH, PATH), {"alignment": "affine"}, "alignment"),
-        ((PATH, PATH), {"delta": 0}, "delta"),
+        ((PATH, PATH), {"alignment": np.eye(2)}, "alignment"),
         ((PATH, PATH), {"delta": 1.5}, "delta"),
-        ((PATH, PATH), {"delta_unit": "m"}, "delta_unit"),
-        ((PATH, PATH), {"max_diff": -1.0}, "max_diff"),
-        ((3, PATH), {}, "estimate"),
-        ((PATH, PATH), {"delta": "x"}, "delta"),
         ((PATH, PATH), {"delta": None}, "delta"),
         ((PATH, PATH), {"delta": np.inf}, "delta"),
+        ((PATH, PATH), {"delta_unit": "m"}, "delta_unit"),
+        ((PATH, PATH), {"max_diff": -1.0}, "max_diff"),
         ((PATH, PATH), {"max_diff": "soon"}, "max_diff"),
-        ((PATH, PATH), {"max_diff": None}, "max_diff"),
-        ((PATH, PATH), {"alignment": ["se3"]}, "alignment"),
-        ((PATH, PATH), {"alignment": np.eye(2)}, "alignment"),
-        ((PATH, PATH), {"delta_unit": np.eye(2)}, "delta_unit"),
+        ((3, PATH), {}, "estimate"),
         ((PATH, from_positions([[0, 0, 0], [1e200, 0, 0]])), {}, "gt"),
         ((PATH, np.eye(4)), {}, "gt"),
     ],
@@ -280,15 +265,10 @@ def test_files_that_cannot_be_read_and_spans_without_end(tmp_path):
     for name in ("x" * 300, "", "nul\0", tmp_path):
         with pytest.raises(InputError, match="cannot be read"):
             evaluate(name, PATH)
-    for giant in (10**400, 10**20, 1e300):
-        if giant == 10**400:  # beyond every float
-            with pytest.raises(InputError, match="delta"):
-                evaluate(PATH, PATH, delta=giant)
-            continue
-        assert (
-            "not enough poses"
-            in evaluate(PATH, PATH, delta=giant)["reasons"]["rpe_trans_rmse"]
-        )
+    # beyond every float
+    with pytest.raises(InputError, match="delta"):
+        evaluate(PATH, PATH, delta=10**400)
+    assert evaluate(PATH, PATH, delta=10**20)["rpe_trans_rmse"] is None
 
 
 def test_every_key_is_documented():

@@ -9,14 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow, make_transform
 from hybridvo.core.options import FlowOptions, Options
 from hybridvo.core.types import Camera
 from hybridvo.lab.evaluation.protocols import pairs_summary, protocols
 from hybridvo.lab.evaluation.scores import same_intrinsics
 from hybridvo.run.commands.compare import compare
-from hybridvo.run.commands.text import text_of
 
 TAG = struct.pack("<f", 202021.25)
 HEIGHT, WIDTH, FRAMES = 32, 64, 5
@@ -111,60 +109,6 @@ def test_the_paper_leaves_out_pairs_whose_intrinsics_change(
     with (tmp_path / "pairs.csv").open() as file:
         epe = [float(row["epe"]) for row in csv.DictReader(file)]
     assert len(epe) == 12 and line["epe"] == pytest.approx(np.mean(epe))
-
-
-def table_rows(latex: str) -> list[list[str]]:
-    """The cells of every line of a LaTeX table."""
-    lines = [line for line in latex.splitlines() if line.endswith("\\\\")]
-    return [
-        [cell.strip() for cell in line.removesuffix("\\\\").split("&")]
-        for line in lines
-    ]
-
-
-@pytest.mark.slow
-def test_one_table_holds_our_errors_and_the_published_ones(
-    sintel: Path, tmp_path: Path
-) -> None:
-    options = Options(flow=FlowOptions(source="file"))
-    methods = ("identity", "pnp-ransac")
-    content = compare(
-        (sintel,), tmp_path, methods=methods, options=options, protocol="paper"
-    )
-    latex = (tmp_path / "report.tex").read_text()
-    assert latex.startswith("% protocol paper: 12 pairs, the complete set has 992")
-    head, *rows = table_rows(latex)
-    figures = ["EPE (component mean, 128x256) [px]", "R\\_err (Euler) [deg]"]
-    assert head == ["method", "inputs", "source", *figures, "T\\_err [m]"]
-    by_method = {row[0]: row for row in rows}
-    published = by_method["PWVO"]
-    assert published[2:] == ["PWVO paper, Table 1", "0.626", "0.081", "0.043"]
-    assert len(rows) == 2 + len(protocols()["paper"].published)
-    still = by_method["identity"]
-    assert "(true) flow" in still[1] and still[2] == "this comparison"
-    # the component mean of the motion, in the unit of the published figures
-    assert still[5] == f"{np.abs(STEP).mean():.3g}"
-    # true flow and true depth
-    assert float(by_method["pnp-ransac"][3]) < float(still[3])
-
-    lines = text_of("compare", content).splitlines()
-    (row,) = [
-        line for line in lines if "PWVO paper, Table 1" in line and "0.626" in line
-    ]
-    assert "0.081" in row and "0.043" in row
-    (row,) = [
-        line for line in lines if "identity" in line and "this comparison" in line
-    ]
-    assert still[3] in row and still[5] in row
-
-    markdown = (tmp_path / "report.md").read_text()
-    (row,) = [line for line in markdown.splitlines() if line.startswith("| PWVO |")]
-    assert "0.626" in row and "0.043" in row
-
-
-def test_other_sequences_are_refused(walk: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="walk"):
-        compare((walk,), tmp_path / "out", protocol="paper")
 
 
 def test_cameras_are_the_same_to_rounding() -> None:

@@ -13,14 +13,9 @@ import pytest
 
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.trajectory import Trajectory
-from hybridvo.lab.evaluation.charts import (
-    error_distribution,
-    factor_charts,
-    path_charts,
-)
 from hybridvo.lab.evaluation.metrics import evaluate
 from hybridvo.lab.evaluation.protocols import pairs_summary, protocols
-from hybridvo.lab.evaluation.report import number, origin_of, write_report
+from hybridvo.lab.evaluation.report import write_report
 from hybridvo.lab.evaluation.scores import (
     pair_table,
     sequence_row,
@@ -41,35 +36,19 @@ def results(tmp_path: Path) -> tuple[Path, dict[str, Any], pd.DataFrame]:
     gt = Trajectory(np.arange(7) / 10, poses)
     (tmp_path / "trajectories").mkdir()
     gt.save(tmp_path / "trajectories" / "gt.tum")
+    errors = {
+        "rot_err_deg": 0.1,
+        "trans_err": 0.01,
+        "r_err_deg": 0.1,
+        "t_err": 0.01,
+    }
+    fixed = {"status": "ok", "message": "", "ms": 10.0, "flow_ms": 5.0, "epe": 0.1}
     pairs = [
-        {
-            **{
-                "sequence": NAME + flow,
-                "index": i,
-                "prev": i,
-                "next": i + 1,
-                "method": method,
-            },
-            **{
-                "flow_source": flow,
-                "status": "ok",
-                "message": "",
-                "ms": 10.0,
-                "flow_ms": 5.0,
-            },
-            **{
-                "epe_l2_px": epe * (1 + i) * (1e-3 if "true" in flow else 1),
-                "epe": 0.1,
-            },
-            **{
-                "rot_err_deg": 0.1,
-                "trans_err": 0.01,
-                "r_err_deg": 0.1,
-                "t_err": 0.01,
-            },
-            # rotation: one bin
-            **{"dynamic_fraction": 0.1 * i, "rotation_deg": 0.2},
-        }
+        fixed
+        | errors
+        | {"sequence": NAME + flow, "index": i, "prev": i, "next": i + 1}
+        | {"method": method, "flow_source": flow, "dynamic_fraction": 0.1 * i}
+        | {"epe_l2_px": epe * (1 + i) * (1e-3 if "true" in flow else 1)}
         for flow in FLOWS
         for method, epe in ERRORS.items()
         for i in range(6)
@@ -146,56 +125,6 @@ def test_the_page_needs_no_other_file_and_runs_no_name(results) -> None:
         and "&lt;b&gt;walk" in body
         and "<script></" not in body
     )
-
-
-def test_the_origin_is_for_people(results) -> None:
-    origin = dict(origin_of(results[1]))
-    assert origin == {
-        "command": "compare '<i>my walk</i>'",
-        "versions": "numpy 2.4",
-        "machine": "cpus 2",
-        "weights": "hybrid 0123456789ab",
-        "options": "refine.cutoff=2.5",  # what is not as by default
-    }
-    plain = results[1] | {"options": {"refine": {"cutoff": 3.0}}, "weights": {}}
-    assert dict(origin_of(plain))["options"] == "the defaults"
-    assert dict(origin_of(plain))["weights"] == "none"
-
-
-def test_charts_show_every_method_and_no_single_bins(results) -> None:
-    folder, result, pairs = results
-    methods = list(ERRORS)
-    pairs = pairs[pairs["flow_source"] == "dis"]
-    (spread,) = error_distribution(pairs, methods)
-    assert {trace.name for trace in spread.data} == set(ERRORS) and len(
-        spread.data
-    ) == 3
-    assert len({trace.marker.color for trace in spread.data}) == 3
-    curve = next(trace for trace in spread.data if trace.name == "pnp-ransac")
-    assert curve.y[-1] == 100 and list(curve.x) == sorted(curve.x)
-    (factor,) = factor_charts(pairs, methods)  # the rotation has one bin
-    assert "fraction of pixels" in factor.layout.xaxis.title.text
-    above, errors = path_charts(
-        folder, result["sequences"][1], result["rows"], pairs, methods
-    )
-    gt, *paths = above.data
-    assert gt.name == "ground truth" and len(paths) == len(errors.data) == 3
-    # aligned: the same path
-    np.testing.assert_allclose(paths[0].x, gt.x, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (1234.5, "1234"),
-        (0.012345, "0.0123"),
-        (0.0, "0"),
-        (None, "-"),
-        (float("nan"), "-"),
-    ],
-)
-def test_numbers_for_people(value: float | None, text: str) -> None:
-    assert number(value) == text
 
 
 @pytest.mark.parametrize(

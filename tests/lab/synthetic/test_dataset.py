@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import cv2
 import numpy as np
 import pytest
 
@@ -13,7 +12,6 @@ from hybridvo.lab.synthetic import dataset
 from hybridvo.lab.synthetic.draws import STORED, sample_generator
 from hybridvo.lab.synthetic.paper_samples import PaperOptions
 from hybridvo.lab.synthetic.training_scenes import DiverseOptions
-from hybridvo.run.commands.train import generate
 
 SIZE = {"height": 32, "width": 64}
 
@@ -58,12 +56,3 @@ def test_damage_and_nonsense_are_named(tmp_path):
         dataset.read_sample(tmp_path / "a", 0)
     with pytest.raises(InputError, match="count"):
         list(dataset.write_samples(PaperOptions(**SIZE), 0, tmp_path / "b"))
-
-
-def test_the_command_writes_samples_and_a_contact_sheet(tmp_path):
-    sheet = generate("paper", 3, tmp_path / "a", size=(32, 64))
-    image = cv2.imread(str(sheet))
-    assert image.shape[1] == 1400  # seven tiles of a pair's size
-    assert dataset.read_sample(tmp_path / "a", 0).flow.shape == (32, 64, 2)
-    with pytest.raises(InputError, match="no such file"):
-        generate("real", 3, tmp_path / "b")

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import os
 
 import cv2
@@ -54,19 +53,6 @@ def test_depth_of_a_sphere_by_hand():
     assert depth[5, 14] == pytest.approx(9.6 / 2.08, rel=1e-6)
     # ray (0.25, 0, 1) misses: 1.0625 t^2 - 10 t + 24 has discriminant -2
     assert np.isinf(depth[5, 15])
-
-
-def test_nothing_hit_is_invalid_everywhere():
-    scene = single(
-        Solid(ELLIPSOID, affine((1, 1, 1), (0, 0, -5)), object_id=1), frames=2
-    )
-    frame = scene.render(0)
-    flow, moving = scene.flow(0)
-    assert np.isinf(frame.depth).all()
-    assert (scene.object_id(0) == -1).all()
-    assert not frame.rgb.any()
-    assert np.isnan(flow).all()
-    assert not moving.any()
 
 
 # ---------------------------------------------------------------- flow
@@ -127,18 +113,6 @@ def test_brightness_constancy(scenes, kind):
     assert np.median(error) < 2.5
     assert np.median(error) < 0.4 * np.median(still)
     assert np.mean(error > 20) < 0.12
-
-
-def test_noise_has_the_given_standard_deviation_and_is_repeatable():
-    quiet = make_scene("static", 0, height=64, width=96)
-    noisy = dataclasses.replace(quiet, noise=4.0)
-    image = quiet.render(1).rgb.astype(float)
-    difference = noisy.render(1).rgb - image
-    difference = difference[(image > 30) & (image < 225)]
-    # rounding twice adds 1/12 each: sqrt(16 + 1/6) = 4.02; n > 1e4 values: spread below 2 %
-    assert difference.std() == pytest.approx(4.02, rel=0.05)
-    np.testing.assert_array_equal(noisy.render(1).rgb, noisy.render(1).rgb)
-    assert (noisy.render(0).rgb != noisy.render(1).rgb).any()
 
 
 # ---------------------------------------------------------------- families
@@ -206,12 +180,7 @@ def test_bad_arguments_name_themselves(change, words):
 def test_sequence(scenes):
     scene = scenes["light"]
     sequence = SyntheticSequence(scene, name="demo")
-    assert (len(sequence), sequence.kind, sequence.depth_source) == (
-        6,
-        "synthetic",
-        "true",
-    )
-    assert sequence.has_flow
+    assert (len(sequence), sequence.depth_source) == (6, "true")
     assert sequence.flow_is_true
     np.testing.assert_allclose(sequence.timestamps, np.arange(6) / 24)
     frame = sequence.frame(2)

@@ -4,49 +4,18 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 
 from hybridvo.core.geometry import make_transform
 from hybridvo.core.types import Camera
 from hybridvo.lab.synthetic import training_scenes
 from hybridvo.lab.synthetic.bodies import moving_object, stairs
 from hybridvo.lab.synthetic.paper_samples import camera_flow
-from hybridvo.lab.synthetic.raycast import BOX
 from hybridvo.lab.synthetic.render import Scene
 from hybridvo.lab.synthetic.training_scenes import render_pair, training_scene
 
 
 def generator(seed: int) -> np.random.Generator:
     return np.random.default_rng([7, seed])
-
-
-def test_stairs_are_a_row_of_boxes_with_even_steps() -> None:
-    belts = 0
-    rising = 0
-    for seed in range(40):
-        parts = stairs(generator(seed))
-        assert all(part.shape == BOX for part in parts)
-        centres = np.array([part.A_object_unit[:, 3] for part in parts])
-        assert np.isfinite([part.A_object_unit for part in parts]).all()
-        x = centres[:, 0]
-        # a belt lies in the middle, below all of them
-        has_belt = len(x) > 2 and x[-1] == 0 and x[-2] > 0.5
-        belts += has_belt
-        steps = parts[:-1] if has_belt else parts
-        x = x[: len(steps)]
-        assert 4 <= len(steps) <= 14
-        spacing = np.diff(x)
-        np.testing.assert_allclose(spacing, 2 / len(steps))
-        assert x[0] == pytest.approx(-x[-1]) and np.abs(x).max() < 1
-        # all go up, or none
-        bottom = [
-            part.A_object_unit[1, 3] + part.A_object_unit[1, 1] for part in steps
-        ]
-        rise = np.diff(bottom)
-        np.testing.assert_allclose(rise, rise[0], atol=1e-12)
-        assert rise[0] <= 0
-        rising += rise[0] < 0
-    assert 8 < belts < 32 and 8 < rising < 32
 
 
 def test_stairs_move_as_one() -> None:
@@ -66,29 +35,6 @@ def test_stairs_move_as_one() -> None:
         pair.flow[seen][:, 0], expected, rtol=1e-3, atol=1e-3
     )
     np.testing.assert_allclose(pair.flow[seen][:, 1], 0, atol=1e-3)
-
-
-def test_some_scenes_have_a_conveyor_in_place_of_the_usual_objects(
-    monkeypatch,
-) -> None:
-    drawn = []
-    draw = training_scenes._draw_conveyor
-
-    def noting(*arguments):
-        drawn.append(1)
-        return draw(*arguments)
-
-    monkeypatch.setattr(training_scenes, "_draw_conveyor", noting)
-    for seed in range(6):
-        training_scene(generator(seed), 48, 64)
-    assert not drawn
-    moving = []
-    for seed in range(6):
-        scene = training_scene(generator(seed), 48, 64, conveyor_fraction=1.0)
-        assert len({solid.object_id for solid in scene.solids} - {0}) <= 1
-        moving.append(float(render_pair(scene, images=False).moving.mean()))
-    assert len(drawn) == 6
-    assert np.median(moving) > 0.1 and max(moving) < 0.9
 
 
 def test_a_rendered_pair_obeys_its_motion_where_nothing_moves() -> None:

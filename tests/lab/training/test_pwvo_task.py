@@ -205,38 +205,6 @@ def test_a_refit_in_the_true_mask_is_right(batch, looks):
     assert (error < limit)[clear].all()
 
 
-def test_no_motion_and_priors_are_laid_over_a_batch(batch):
-    wanted = torch.arange(len(batch)) == 0
-    more = batch.with_no_motion(wanted)
-    assert len(more.inputs.owner) == len(batch.inputs.owner) + 1
-    assert int(more.inputs.owner[-1]) == 0
-    one, two = (
-        batch.with_motion_prior(np.random.default_rng(1)).inputs for _ in range(2)
-    )
-    assert torch.equal(one.T_prior, two.T_prior)
-    drawn = [
-        batch.with_motion_prior(np.random.default_rng(k)).inputs.has_prior
-        for k in range(40)
-    ]
-    fraction = float(torch.cat(drawn).float().mean())
-    assert 0.4 < fraction < 0.8
-    assert not batch.inputs.has_prior.any()
-
-
-def test_a_part_of_a_batch_is_its_samples(batch):
-    """Each sample keeps its maps and its motions, which are numbered anew."""
-    numbers = range(1, len(batch), 2)
-    part = batch.part(numbers)
-    assert len(part) == len(numbers)
-    for k, b in enumerate(numbers):
-        assert torch.equal(part.inputs.depth[k], batch.inputs.depth[b])
-        assert torch.equal(part.T[k], batch.T[b])
-        np.testing.assert_array_equal(part.samples[k], batch.samples[b])
-        mine = part.inputs.pose[part.inputs.owner == k]
-        assert torch.equal(mine, batch.inputs.pose[batch.inputs.owner == b])
-    assert torch.equal(part.inputs.parent, torch.arange(len(part.inputs.pose)))
-
-
 def test_the_losses_of_a_batch_are_those_of_its_samples(batch):
     """Whatever the others of a batch are, and however many motions they have."""
     motions = torch.bincount(batch.inputs.owner)
@@ -282,22 +250,3 @@ def test_every_loss_has_a_gradient(batch):
 
 
 # --- samples ----------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_samples_are_ambiguous_and_of_several_kinds():
-    samples = [s for seed in range(10) for s in draw_samples(seed, Makers())]
-    assert len(samples) >= 5
-    for sample in samples:
-        count = int(sample["count"])
-        assert 1 <= count <= hypothesis_samples.MAX_MOTIONS
-        assert np.isfinite(sample["poses"]).all() and sample["limit"] > 0
-        assert (sample["poses"][count:] == 0).all()
-        kinds = set(np.unique(sample["label"]).tolist())
-        assert kinds <= {
-            hypothesis_samples.MOVING,
-            hypothesis_samples.STATIC,
-            hypothesis_samples.UNKNOWN,
-        }
-    images = [bool(sample["image_prev"].any()) for sample in samples]
-    assert any(images)

@@ -161,15 +161,6 @@ def test_the_command_by_torchrun(tmp_path: Path) -> None:
     assert len(read_log(tmp_path / "run")) == 2
 
 
-def test_one_process_is_the_only_rank() -> None:
-    assert (ranks.count(), ranks.own(), ranks.is_first()) == (1, 0, True)
-    assert ranks.part(range(4)) == range(4)
-    assert ranks.mean_figures({"loss": 2.0}) == {"loss": 2.0}
-    assert (ranks.of_first(3.0), ranks.any_of(True)) == (3.0, True)
-    with ranks.joined("cpu"):
-        assert ranks.count() == 1
-
-
 def test_the_second_of_three_ranks_has_its_part(monkeypatch: Any) -> None:
     monkeypatch.setattr(ranks, "count", lambda: 3)
     monkeypatch.setattr(ranks, "own", lambda: 1)

@@ -66,30 +66,19 @@ def test_resume_is_equal(mixture, tmp_path):
     assert whole.samples == second.samples == 24
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_another_record_is_refused_and_the_log_may_change(mixture, tmp_path):
+    Trainer(PaperTask(TINY, mixture), tmp_path).save()
+    for changes in (
         {"seed": 1},
         {"loss": LossOptions(translation_form="laplace")},
         {"network": NetworkOptions(width=0.1, head_stride=2, decoders=2)},
-    ],
-)
-def test_another_record_is_refused(mixture, tmp_path, changes):
-    Trainer(PaperTask(TINY, mixture), tmp_path).save()
-    with pytest.raises(
-        InputError, match=f"another {next(iter(changes))}.*was.*now"
     ):
-        Trainer(PaperTask(changed(**changes), mixture), tmp_path).resume()
-
-
-def test_other_data_are_refused_and_the_log_may_change(mixture, tmp_path):
-    Trainer(PaperTask(TINY, mixture), tmp_path).save()
-    other = Mixture(
-        (PaperOptions(height=32, width=64, objects=3), mixture.presets[1]),
-        (0.5, 0.5),
-    )
+        other = PaperTask(changed(**changes), mixture)
+        with pytest.raises(InputError, match=f"another {next(iter(changes))}"):
+            Trainer(other, tmp_path).resume()
+    presets = (PaperOptions(height=32, width=64, objects=3), mixture.presets[1])
     with pytest.raises(InputError, match="data"):
-        Trainer(PaperTask(TINY, other), tmp_path).resume()
+        Trainer(PaperTask(TINY, Mixture(presets, (0.5, 0.5))), tmp_path).resume()
     assert Trainer(PaperTask(changed(log_every=1), mixture), tmp_path).resume()
     assert not Trainer(PaperTask(TINY, mixture), tmp_path / "none").resume()
 
@@ -128,24 +117,6 @@ def test_time_limit_and_request_end_with_a_checkpoint(mixture, tmp_path):
     assert trainer.run() == "signal"
     again = Trainer(PaperTask(TINY, mixture), tmp_path)
     assert again.resume() and again.step == 2
-
-
-def test_progress_is_told_after_the_first_update_and_every_ten_seconds(
-    mixture, tmp_path, monkeypatch
-):
-    told: list[str] = []
-    trainer = Trainer(PaperTask(TINY, mixture), tmp_path, on_progress=told.append)
-    batch = batch_of(mixture)
-    monkeypatch.setattr("hybridvo.lab.training.trainer.time.monotonic", lambda: 0.0)
-    for passed in (0.0, 12.0, 5.0, 6.0):
-        # as if the updates before had taken so long
-        trainer.elapsed_s += passed
-        trainer.advance(batch, 500.0)
-    assert told == [
-        "update 1 of 6, 0 of 500 s",
-        "update 2 of 6, 12 of 500 s",
-        "update 4 of 6, 23 of 500 s",
-    ]
 
 
 def test_a_step_that_is_not_finite_ends_the_run(mixture, tmp_path):
