@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
-import subprocess
 from pathlib import Path
 
 import pytest
-from safetensors import safe_open
 
 from hybridvo.network.weights import pretrained, weights_file
 
@@ -18,41 +15,6 @@ NAMES = sorted(pretrained())
 
 def card_of(name: str) -> dict:
     return json.loads(weights_file(name).with_suffix(".json").read_text("utf-8"))
-
-
-def source_at(commit: str) -> str:
-    """The sources of the networks at a commit; skip without the history."""
-    command = ["git", "-C", str(ROOT), "grep", "-h", "", commit, "--"]
-    try:
-        known = subprocess.run(
-            ["git", "-C", str(ROOT), "cat-file", "-e", f"{commit}^{{commit}}"],
-            capture_output=True,
-        )
-    except OSError:
-        pytest.skip("git is not installed")
-    if known.returncode:
-        shallow = subprocess.run(
-            ["git", "-C", str(ROOT), "rev-parse", "--is-shallow-repository"],
-            capture_output=True,
-            text=True,
-        )
-        if shallow.stdout.strip() != "false":
-            pytest.skip("the history is not here, or not whole")
-        pytest.fail(f"{commit}: no such commit")
-    return subprocess.run(
-        [*command, "hybridvo/network/*.py"], capture_output=True, text=True
-    ).stdout
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_commit_of_a_card_contains_its_network(name: str) -> None:
-    with safe_open(weights_file(name), framework="pt") as file:
-        kind = json.loads(file.metadata()["options"])["kind"]
-        modules = {key.split(".")[0] for key in file.keys()}
-    source = source_at(card_of(name)["commit"])
-    assert f'"{kind}"' in source
-    absent = [m for m in modules if not re.search(rf"\bself\.{m}\b", source)]
-    assert not absent
 
 
 def test_cards_have_the_figures_of_the_page() -> None:

@@ -108,15 +108,6 @@ def test_translation_by_hand():
         assert parts["translation"].item() == pytest.approx(expected, abs=1e-9)
 
 
-def test_vonet_is_plain_l1():
-    output = PixelwisePrediction(constant_maps((1.0, 2, 3, 0, 0, 1), size=(1, 1)))
-    targets = make_targets(rotation=(1, 2, 0), translation=(0, 0.5, 0))
-    loss, parts = total_loss(output, targets, LossOptions(**POSE, **PLAIN), shift())
-    assert parts["rotation"].item() == pytest.approx(1.0)
-    assert parts["translation"].item() == pytest.approx(0.5)
-    assert loss.item() == pytest.approx(1.5)
-
-
 S = (0.3, -0.5, 1.0, 2.0, -1.0, 0.7)
 
 
@@ -155,19 +146,6 @@ def test_depth_by_hand():
         math.exp(-0.25 * S[c]) * 0.15 + 0.25 * S[c] for c in (0, 1, 5)
     )
     assert parts["depth"].item() == pytest.approx(expected, abs=1e-12)
-
-
-def test_total_is_the_weighted_sum():
-    prediction = predict((1, 0, 0), (0, 1, 0), S[:3], S[3:])
-    options = LossOptions(flow_weight=5.0)
-    loss, parts = total_loss(
-        prediction, make_targets(depth_curr=3.0), options, shift(0.1, 0, 0.1)
-    )
-    assert set(parts) == {"rotation", "translation", "flow", "depth"}
-    expected = sum(
-        (5 if name == "flow" else 1) * part.item() for name, part in parts.items()
-    )
-    assert loss.item() == pytest.approx(expected)
 
 
 def test_pixels_without_depth_do_not_count():

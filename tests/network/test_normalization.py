@@ -77,18 +77,6 @@ def test_scales_by_hand():
     assert float(inputs.inverse_depth[0, 1].abs().max()) == 0
 
 
-def test_change_of_depth_is_counted_in_units_of_the_motion():
-    flow = np.zeros((32, 64, 2))
-    flow[..., 0] = 3.0
-    inputs, _ = normalize(
-        inputs_of(flow, np.full((32, 64), 2.0), np.full((32, 64), 2.2)), SCALE_FREE
-    )
-    change = np.log(1.1) / 0.05
-    np.testing.assert_allclose(
-        inputs.inverse_depth[0, 1], change / (1 + change / 10), rtol=1e-4
-    )
-
-
 @settings(max_examples=15, deadline=None)
 @given(factor=st.floats(0.1, 10.0))
 def test_a_scene_twice_as_large_moves_by_twice_as_many_metres(factor):

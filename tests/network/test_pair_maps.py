@@ -106,30 +106,6 @@ def test_a_pair_without_data_is_uncertain_and_changes_no_other(
     assert not motion.status[1].usable
 
 
-def test_few_usable_pixels_have_maps_of_the_same_shape(network, pairs) -> None:
-    flow = pairs[0].flow.copy()
-    flow[:, 14:] = np.nan
-    few = replace(pairs[0], flow=flow)
-    with torch.no_grad():
-        look = look_at_pair(network, few)
-        maps = predict_pairs(network, [pairs[0], few])
-    assert look is not None
-    # the search of the few has a finer grid
-    assert look.prediction.motion.shape[2] > maps.motion.shape[2]
-    assert torch.isfinite(maps.motion).all() and len(maps.lead) == 2
-
-
-def test_images_and_the_second_depth_may_be_missing(network) -> None:
-    pair, _ = worlds.world()
-    with torch.no_grad():
-        whole = network(pair)
-        no_images = network(without(without(pair, "prev", "rgb"), "curr", "rgb"))
-        no_second = network(without(pair, "curr", "depth"))
-    for maps in (whole, no_images, no_second):
-        for name in MAPS:
-            assert torch.isfinite(getattr(maps, name)).all(), name
-
-
 def test_pwvo_looks_at_the_images_of_a_batch(network) -> None:
     pair, _ = worlds.world(noise=(0.3, 0.01), movers=2)
     batch = PairBatch.from_pairs([pair], dtype=torch.float64)
@@ -226,23 +202,6 @@ def test_the_pairs_of_a_batch_are_those_that_made_it(dtype) -> None:
         )
 
 
-def test_the_pairs_of_a_bare_batch_lack_what_it_lacks() -> None:
-    pair, _ = worlds.world(texture=False, second_depth=False)
-    batch = PairBatch.from_pairs([pair])
-    flow = batch.flow.clone().requires_grad_()
-    (again,) = replace(batch, flow=flow, valid=None).pairs()
-    assert again.prev.rgb is None and again.curr.rgb is None
-    assert again.curr.depth is None and again.flow_variance is None
-    assert again.flow_valid is None and again.prev.depth_variance is None
-    np.testing.assert_array_equal(again.flow, pair.flow)
-
-
-@pytest.mark.parametrize("wrong", [None, "pair", [1], np.zeros((4, 4))])
-def test_what_is_no_pair_is_refused(network, wrong) -> None:
-    with pytest.raises(InputError, match="PWVO"):
-        network(wrong)
-
-
 # --- the images of a batch --------------------------------------------------------
 
 
@@ -263,12 +222,6 @@ def test_a_pair_keeps_its_images_beside_one_that_has_none() -> None:
         without_any = PairBatch.from_pairs([other, bare])
         assert without_any.rgb_prev is None and without_any.rgb_curr is None
         assert without_any.has_images is None
-
-
-def test_every_pair_has_images_where_a_batch_says_nothing_else() -> None:
-    pair, _ = worlds.world()
-    batch = replace(PairBatch.from_pairs([pair, pair]), has_images=None)
-    assert [each.has_images for each in batch.pairs()] == [True, True]
 
 
 def test_images_of_another_shape_or_type_are_refused(network) -> None:
@@ -381,16 +334,3 @@ def test_a_pair_says_the_same_whatever_is_beside_it(network, unlike, dtype) -> N
         assert_same(
             together, k, answer(network, [pair], dtype), ROUNDING[dtype], kind
         )
-
-
-def test_a_pair_says_the_same_beside_more_and_beside_fewer_motions(
-    network, unlike
-) -> None:
-    fewer = unlike["no images, one motion"]
-    pair = unlike["images"]
-    more = unlike["no images, many motions"]
-    assert motions_of(fewer) < motions_of(pair) < motions_of(more)
-    alone = answer(network, [pair], torch.float64)
-    for other in (fewer, more):
-        beside = answer(network, [other, pair], torch.float64)
-        assert_same(beside, 1, alone, ROUNDING[torch.float64], "beside one")

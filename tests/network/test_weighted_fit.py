@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -105,49 +104,6 @@ def test_samples_do_not_see_each_other() -> None:
     for k in (0, 2):
         alone = weighted_fit(*parts[k], weights[k : k + 1], EYE)
         torch.testing.assert_close(T[k : k + 1], alone, rtol=0, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_the_gradient_leads_downhill() -> None:
-    """A step against the gradient makes the whole fit better: on all of ten seeds when written."""
-    for seed in range(4):
-        ray, inverse, target, which = scene(seed, [WORLD, OBJECT], [0.6, 0.4], 2e-3)
-        weights = torch.where(which == 0, 1.0, 0.7).double()[None].requires_grad_()
-
-        def loss(weights: torch.Tensor) -> torch.Tensor:
-            T = EYE
-            for _ in range(5):
-                T = weighted_fit(ray, inverse, target, weights, T.detach())  # noqa: B023
-            return (T[0, :3] - torch.from_numpy(se3_exp(WORLD))[:3]).square().sum()
-
-        value = loss(weights)
-        value.backward()
-        step = 0.2 * weights.grad / weights.grad.abs().max()
-        with torch.no_grad():
-            assert (
-                float(loss(weights - step))
-                < float(value)
-                < float(loss(weights + step))
-            )
-
-
-def test_doubt_learns_where_the_world_is() -> None:
-    """Descent on the error of the fit alone raises s on the mover, although nobody labels it."""
-    ray, inverse, target, which = scene(7, [WORLD, OBJECT], [0.35, 0.65], 1e-3)
-    s = torch.zeros(1, 1, 1, COUNT, dtype=torch.float64)
-    s.requires_grad_()
-    valid = torch.ones(1, 1, COUNT, dtype=torch.bool)
-    optimizer = torch.optim.Adam([s], lr=0.05)
-    truth = torch.from_numpy(se3_exp(WORLD))
-    for _ in range(40):
-        optimizer.zero_grad()
-        T = weighted_fit(
-            ray, inverse, target, pixel_weights(s, valid).flatten(1), EYE
-        )
-        (T[0, :3] - truth[:3]).abs().sum().backward()
-        optimizer.step()
-    s = s.detach()
-    assert s[..., which == 1].mean() > s[..., which == 0].mean() + 0.3
 
 
 def test_weights_of_pixels() -> None:

@@ -86,43 +86,10 @@ def test_round_trip(tmp_path, options):
         true = network.state_dict()[name]
         assert value.dtype == torch.float32
         # half a step of 1/127 of an output's largest weight; of a bias the rounding of float16
-        step = (
-            true.abs().flatten(1).amax(1) / 127
-            if true.dim() > 1
-            else true.abs() / 1024
-        )
-        error = (
-            (value - true).abs().flatten(1).amax(1)
-            if true.dim() > 1
-            else (value - true).abs()
-        )
+        rows = true.flatten(1) if true.dim() > 1 else true.reshape(-1, 1)
+        step = rows.abs().amax(1) / (127 if true.dim() > 1 else 1024)
+        error = (value - true).reshape(rows.shape).abs().amax(1)
         assert (error <= 0.51 * step + 2**-24).all()
-
-
-def test_weights_in_float32_are_read_as_they_are(saved, network):
-    def plain(tensors):
-        tensors.clear()
-        tensors.update(
-            {
-                name: value.contiguous()
-                for name, value in network.state_dict().items()
-            }
-        )
-
-    rewrite(saved, plain)
-    for name, value in load_weights(saved)[0].state_dict().items():
-        assert torch.equal(value, network.state_dict()[name])
-
-
-def test_saving_refuses_what_could_not_be_loaded(tmp_path, network):
-    path = tmp_path / "x.safetensors"
-    with pytest.raises(OutputError, match="nowhere"):
-        save_weights(tmp_path / "nowhere" / "x.safetensors", network, CARD)
-    with torch.no_grad():
-        network.decoder.out.bias[0] = 1e6  # above float16
-    with pytest.raises(InputError, match=r"decoder\.out\.bias"):
-        save_weights(path, network, CARD)
-    assert not path.exists()
 
 
 def test_missing_truncated_and_foreign_files(tmp_path, saved):
@@ -202,14 +169,6 @@ def test_the_checksum_is_of_what_this_page_says(saved):
     assert stated == total.hexdigest()
 
 
-def test_an_older_file_without_checksum_is_read_with_a_warning(saved, caplog):
-    rewrite(saved, format=UNSUMMED, checksum=None)
-    with caplog.at_level(logging.WARNING):
-        network, card = load_weights(saved)
-    assert card == CARD and network.options == OPTIONS
-    assert "checksum" in caplog.text and saved.name in caplog.text
-
-
 def test_the_shipped_files_have_their_checksums(caplog):
     for path in pretrained().values():
         _, header = header_of(path)
@@ -267,37 +226,22 @@ def test_tensors_that_are_not_the_networks(saved):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        None,
-        "not json",
-        "{}",
-        '{"kind": [], "width": 1}',
-        '{"kind": "pwvo", "width": 0.125, "depth": 3}',
-    ],
+    "text",
+    [None, "not json", '{"kind": [], "width": 1}', '{"kind": "pwvo", "depth": 3}'],
 )
-def test_damaged_options_and_cards(saved, options):
+def test_damaged_options_and_cards(saved, text):
     content = saved.read_bytes()
-    rewrite(saved, options=options)
+    rewrite(saved, options=text)
     refuses(saved)
-    saved.write_bytes(content)
-    rewrite(saved, card=options if options != "{}" else "null")
-    if options is None or not options.startswith("{"):
+    if text is None or not text.startswith("{"):
+        saved.write_bytes(content)
+        rewrite(saved, card=text)
         refuses(saved)
 
 
 def test_pretrained_weights_load_and_are_small():
-    rows = {
-        "pwvo-paper",
-        "pwvo-uncertain",
-        "pwvo-naive",
-        "pixelwise",
-        "vonet",
-        "vonet-attention",
-    }
     names = list(pretrained())
-    assert set(names) == {"pwvo", *rows}
-    assert set(PAPER_NAMES) == rows
+    assert set(names) == {"pwvo", *PAPER_NAMES}
     for name in names:
         network, card = load_weights(name)
         kind = "pwvo" if name == "pixelwise" else name.split("-")[0]
@@ -354,13 +298,6 @@ def test_our_pwvo_is_saved_and_read(tmp_path):
         torch.testing.assert_close(stored, value, atol=step, rtol=0)
 
 
-def test_pwvo_is_not_the_papers(saved):
-    with pytest.raises(CheckpointError, match="of the paper"):
-        PWVO.from_pretrained(saved)
-    with pytest.raises(CheckpointError, match="of the paper"):
-        PWVO.from_pretrained("vonet")
-
-
 def test_scales_that_fit_no_tensor_are_refused(saved):
     name = "head_motion.0.weight"
     content = saved.read_bytes()
@@ -373,3 +310,22 @@ def test_scales_that_fit_no_tensor_are_refused(saved):
 
     rewrite(saved, cut)
     refuses(saved, name)
+
+
+def test_saving_refuses_what_could_not_be_loaded(tmp_path, network):
+    path = tmp_path / "x.safetensors"
+    with pytest.raises(OutputError, match="nowhere"):
+        save_weights(tmp_path / "nowhere" / "x.safetensors", network, CARD)
+    with torch.no_grad():
+        network.decoder.out.bias[0] = 1e6  # above float16
+    with pytest.raises(InputError, match=r"decoder\.out\.bias"):
+        save_weights(path, network, CARD)
+    assert not path.exists()
+
+
+def test_an_older_file_without_checksum_is_read_with_a_warning(saved, caplog):
+    rewrite(saved, format=UNSUMMED, checksum=None)
+    with caplog.at_level(logging.WARNING):
+        network, card = load_weights(saved)
+    assert card == CARD and network.options == OPTIONS
+    assert "checksum" in caplog.text and saved.name in caplog.text
