@@ -12,10 +12,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from numba.core import caching, types
+from numba.core import types
 
 from hybridvo.compiled import ahead_of_time
-from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver.noise_estimation import Noise
 from tests.scripts import ROOT
 
@@ -150,28 +149,6 @@ def test_a_kernel_takes_as_many_arguments_as_the_table_states():
         ).parameters
         for signature in signatures:
             assert len(ahead_of_time.read_signature(signature)) == len(names), name
-
-
-def test_nothing_is_compiled_for_others_where_no_folder_can_be_written(monkeypatch):
-    monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
-
-    @njit()
-    def twice(x):
-        return 2 * x
-
-    assert ahead_of_time.is_kept(twice, [["int64"]])
-
-
-def test_a_kernel_waits_for_those_that_it_calls():
-    table = ahead_of_time.read_table()
-    kernels = {name: ahead_of_time.find_kernel(name) for name in table}
-    calls = ahead_of_time.callees(kernels)
-    # from its own file, from a module, and from a file that imports it
-    solved = "hybridvo.solver.newton_kernels:solve_definite"
-    assert solved in calls["hybridvo.solver.robust_fit:solve6"]
-    summed = "hybridvo.solver.kernels:sum_samples"
-    fitted = calls["hybridvo.solver.robust_fit:gauss_newton"]
-    assert {summed, "hybridvo.solver.robust_fit:solve6"} <= set(fitted)
 
 
 def test_all_kernels_can_be_imported_before_the_other_packages_are_installed():

@@ -170,31 +170,3 @@ def test_without_any_folder_to_write_to_it_compiles_in_every_process(
     assert load(source)(21) == 42
     assert "no folder can be written" in caplog.records[-1].message
     assert files(source, "nbi") == []
-
-
-def test_the_number_of_compiled_kernels_is_said_now_and_then(caplog):
-    progress = kernel_cache._Progress()
-    names = [f"kernel {i}" for i in range(25)]
-    for name in names:
-        progress.know(name)
-    progress.load(names[-1])
-    for name in names[:20]:
-        progress.compile(name)
-        # for arguments of other types
-        progress.compile(name)
-    assert [record.message for record in caplog.records] == [
-        "hybridvo: compiling 11 of 25 kernels",
-        "hybridvo: compiling 21 of 25 kernels",
-    ]
-
-
-def test_kernels_that_are_loaded_and_compiled_are_counted(
-    source, monkeypatch, caplog
-):
-    monkeypatch.setattr(kernel_cache, "REPORTED", 1)
-    monkeypatch.setattr(kernel_cache, "_progress", kernel_cache._Progress())
-    load(source)(21)
-    assert caplog.records[-1].message == "hybridvo: compiling 1 of 1 kernels"
-    caplog.clear()
-    load(source)(21)
-    assert not caplog.records

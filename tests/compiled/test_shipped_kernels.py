@@ -137,16 +137,6 @@ def test_it_is_used_where_no_folder_can_be_written(package, monkeypatch, caplog)
     assert caplog.records == []
 
 
-def test_answers_are_those_of_code_for_this_processor(package):
-    of_wheel = load(package)
-    answer = of_wheel(X)
-    shutil.rmtree(package / "compiled")
-    shipped_kernels.shipped_build.cache_clear()
-    of_here = load(package)
-    assert of_here(X) == pytest.approx(answer, rel=ROUNDING)
-    assert hits(of_here) == 0 and hits(of_wheel) == 1
-
-
 @pytest.mark.parametrize("name", ["python", "numba", "llvmlite", "triple"])
 def test_the_code_of_another_version_is_not_used(package, caplog, name):
     restate(package, **{name: "0.1"})
@@ -226,13 +216,3 @@ def test_the_baseline_is_the_level_of_the_x86_64_psabi():
     implied = {"64bit", "crc32", "xsave"}
     stated = shipped_kernels.instructions(build_wheel.FEATURES["x86-64-v3"])
     assert stated == level_1 | level_2 | level_3 | implied
-
-
-def test_numpy_sees_the_same_processor():
-    """Numpy asks the processor itself whether it has level 3."""
-    features = np._core._multiarray_umath.__cpu_features__
-    if "X86_V3" not in features:
-        pytest.skip("this numpy does not know the levels of x86-64")
-    needed = shipped_kernels.instructions(build_wheel.FEATURES["x86-64-v3"])
-    missing = needed - shipped_kernels.instructions(here().features)
-    assert (not missing) == features["X86_V3"]

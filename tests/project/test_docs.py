@@ -85,54 +85,6 @@ def test_every_command_is_understood(page, command):
             script.build_parser().parse_args(rest)
 
 
-def test_doctests_of_the_reference_are_shown_as_code():
-    pytest.importorskip("griffe")
-    pytest.importorskip("mkdocs")
-    hooks = load_script("configs/docs_hooks.py")
-    text = """Add.
-
-Example:
-    >>> add(1, 2)  # doctest: +SKIP
-    3
-
-Returns:
-    The sum.
-
->>> add(
-...     2, 2
-... )
-4"""
-    assert (
-        hooks.fenced(text)
-        == """Add.
-
-Example:
-    ```pycon
-    >>> add(1, 2)
-    3
-    ```
-
-Returns:
-    The sum.
-
-```pycon
->>> add(
-...     2, 2
-... )
-4
-```"""
-    )
-
-
-def test_references_of_the_reference_are_shown_as_names():
-    pytest.importorskip("griffe")
-    pytest.importorskip("mkdocs")
-    hooks = load_script("configs/docs_hooks.py")
-    text = "See :class:`RelativePose`, :func:`~hybridvo.api.estimate`: ``a:b``."
-    expected = "See `RelativePose`, `estimate`: ``a:b``."
-    assert hooks.without_roles(text) == expected
-
-
 @pytest.mark.parametrize(
     "page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix()
 )
@@ -161,26 +113,6 @@ def test_every_reason_that_is_explained_can_occur():
     assert [r.name for r in reasons if f"Reason.{r.name}" not in produced] == []
     outputs = (ROOT / "docs/outputs.md").read_text(encoding="utf-8")
     assert [r.value for r in reasons if f"| `{r.value}` |" not in outputs] == []
-
-
-def test_the_layout_names_every_room():
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    layout = text.partition("## Layout")[2].partition("\n## ")[0]
-    rooms = [
-        f"hybridvo/{path.name}" + "/" * path.is_dir()
-        for path in (ROOT / "hybridvo").iterdir()
-        if path.name not in ("__pycache__", "py.typed")
-    ]
-    assert not [room for room in rooms if f"`{room}`" not in layout]
-
-
-def test_the_layout_says_what_every_folder_of_tests_is_for():
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    (row,) = re.findall(r"^\| `tests/` \|.*$", text, re.MULTILINE)
-    package = {path.name for path in (ROOT / "hybridvo").iterdir()}
-    folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir()}
-    others = folders - package - {"__pycache__"}
-    assert sorted(name for name in others if f"`{name}/`" not in row) == []
 
 
 def test_public_names_that_are_written_exist():

@@ -5,33 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from hybridvo import open_sequence
 from tests.scripts import load_script
 
 live = load_script("tools/bench/live.py")
-
-
-def test_a_recording_goes_to_and_fro(image_walk: Path) -> None:
-    original = open_sequence(image_walk)
-    last = len(original) - 1
-    sequence = live.ToAndFro(original, 2 * len(original))
-    assert len(sequence) == 2 * len(original)
-    np.testing.assert_allclose(np.diff(sequence.timestamps), 1 / 30)
-    # the frame after the last one is the one before it, and then all come again
-    np.testing.assert_array_equal(
-        sequence.frame(last + 1).rgb, original.frame(last - 1).rgb
-    )
-    np.testing.assert_array_equal(
-        sequence.frame(2 * last).rgb, original.frame(0).rgb
-    )
-    assert sequence.frame(last + 1).index == last + 1
-    if original.poses is not None:
-        np.testing.assert_array_equal(
-            sequence.poses[last + 1], original.poses[last - 1]
-        )
 
 
 @pytest.mark.parametrize("mode", ["no limit", "auto"])

@@ -13,9 +13,7 @@ from hybridvo.network.pair_maps import look_at_pair
 from tests.scripts import load_script
 
 makers = load_script("tools/maker_pairs.py")
-calibrate = load_script("tools/calibrate.py")
 sentence = load_script("tools/bench/pwvo_parts.py")
-wide = load_script("tools/bench/wide_steps.py")
 
 
 @pytest.mark.parametrize("flow", ["true", "dis"])
@@ -42,34 +40,6 @@ def test_no_maker_serves_twice() -> None:
         for chosen in (makers.CALIBRATION, makers.TEST)
     )
     assert np.abs(first.T_curr_prev - second.T_curr_prev).max() > 1e-6
-
-
-def test_every_maker_counts_alike() -> None:
-    shares = calibrate.maker_weights(["a"] * 8 + ["b"] * 2)
-    assert shares.mean() == pytest.approx(1)
-    assert shares[:8].sum() == pytest.approx(shares[8:].sum())
-
-
-def test_shares_move_a_fit_to_the_rare_maker() -> None:
-    evidence = np.linspace(-2, 2, 40)[:, None]
-    right = evidence[:, 0] > 0.5
-    right[:3] = True
-    is_rare = np.arange(40) < 3
-    plain = calibrate.fit(evidence, right)
-    shared = calibrate.fit(evidence, right, np.where(is_rare, 8.0, 0.5))
-    assert shared[0] < plain[0]
-
-
-def test_figures_of_a_wide_step() -> None:
-    answers = [
-        wide.Answer(True, True, 1.0),
-        wide.Answer(False, True, 2.0),
-        wide.Answer(True, False, 3.0),
-        wide.Answer(False, False, 4.0),
-    ]
-    row = wide.figures(answers)
-    assert row["right"]["count"] == 2 and row["right"]["of"] == 4
-    assert row["wrong_ok"] == 1 and row["right_not_ok"] == 1
 
 
 def test_every_part_of_the_seed_has_a_row(seeds_of_a_pair) -> None:

@@ -51,22 +51,6 @@ def test_only_what_names_another_commit_is_due(tmp_path, monkeypatch, capsys):
     assert "measured" in capsys.readouterr().out
 
 
-def test_times_and_others_are_all(capsys):
-    shown = {}
-    for kind in ("all", "times", "others"):
-        assert tables.main(["--list", "--kind", kind]) == 0
-        shown[kind] = capsys.readouterr().out.splitlines()
-    assert sorted(shown["times"] + shown["others"]) == sorted(shown["all"])
-    assert all("alone" in line.split() for line in shown["times"])
-
-
-def test_two_tools_never_write_one_file_at_once():
-    chains = tables.by_file(part for part in PARTS if not part.alone)
-    files = [{part.file for part in chain} for chain in chains]
-    assert all(len(names) == 1 for names in files)
-    assert len(files) == len(set.union(*files))
-
-
 def test_a_part_that_fails_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tables, "LOGS", tmp_path)
     monkeypatch.setattr(tables, "RESULTS", ROOT / "docs" / "results")

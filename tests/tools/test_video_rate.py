@@ -8,12 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hybridvo.core.geometry import invert
 from hybridvo.core.results import Edge, Reason, RelativePose, Status, Step
-from tests.scripts import ROOT, load_script
+from tests.scripts import load_script
 
 video = load_script("tools/bench/video_rate.py")
-ORIGIN = ("command", "commit", "machine")
 
 
 def test_depth_noise_is_that_of_structured_light():
@@ -102,37 +100,3 @@ def test_motions_from_one_keyframe_and_their_correlation():
     scatter = np.array([0.2366, 0.4732, 1.0])
     assert video.correlation_of(scatter) == pytest.approx(0.8, abs=1e-3)
     assert video.correlation_of(np.array([])) is None
-
-
-def test_an_error_beyond_the_step_is_no_ok_step_where_it_is_flagged():
-    truth = np.stack([np.eye(4)] * 2)
-    flagged = step(1, 0, translation(0.1), translation(-0.1), ok=False)
-    steps = [step(0, None, np.eye(4), truth[0]), flagged]
-    figures = video.path_figures(steps, truth)
-    assert figures["ok_and_off"] == 0
-    assert figures["end_cm"] == pytest.approx(10.0)
-    np.testing.assert_allclose(invert(flagged.T_curr_prev), flagged.T_world_cam)
-
-
-@pytest.mark.slow
-def test_the_results_page_shows_the_part_once_it_is_measured():
-    made = load_script("tools/make_docs.py")
-    results = made.read(ROOT / "docs/results")
-    results["benchmark"].pop("video_rate", None)
-    assert made.table(made.tables(results), "video_rate") == ""
-    assert "\n\n\n" not in made.page(results)
-
-    run = {"end_cm": 1.25, "sigma_cm": 0.5, "steps": 4, "failed": 0}
-    run |= {"ok_and_off": 3, "nees": [1.0, 2.0, 2.0, 30.0], "ms": [7.0]}
-    run |= {"scatter": []}
-    run |= {"positions": [1.0, 14.0, 14.1, 14.2]}
-    row = {"kind": "light", "noise": "exact"} | video.summarise_runs([run])
-    content = {"method": "hybrid", "seeds": [0, 0], "frames": 5, "rows": [row]}
-    content |= {"frame_rate": 30.0, "size": [240, 320], "off_mm": 5.0}
-    content |= {"standing": [{"recording": "books"} | video.summarise_runs([run])]}
-    origin = {name: results["benchmark"]["heavy"][name] for name in ORIGIN}
-    results["benchmark"]["video_rate"] = content | origin
-    figures = "| 1.25 | 1.25 | 0.5 | 3 of 4 | 0 | 2 | 25.0 % | 75.0 % | 7 |"
-    page = made.page(results)
-    assert f"| light, exact {figures}" in page
-    assert f"| books {figures}" in page
