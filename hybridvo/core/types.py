@@ -659,7 +659,11 @@ class PairBatch:
         )
 
     def pairs(self) -> list[FramePair]:
-        """Return the pairs as numpy arrays, without gradient."""
+        """Return the pairs as numpy arrays, without gradient.
+
+        Returns:
+            The pairs, in the order of the samples.
+        """
         arrays = {
             name: None if value is None else value.detach().cpu().numpy()
             for name, value in vars(self).items()

@@ -119,7 +119,7 @@ def test_a_fit_that_has_not_converged_is_degraded_by_either(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pair, T = noisy_world()
-    far = se3_exp(np.array([0.1, 0.1, 0.1, 0.03, 0.03, 0.03])) @ T
+    far = se3_exp(np.array([0.02, 0.02, 0.02, 0.006, 0.006, 0.006])) @ T
     estimate = NoiseEstimate(Noise(0.3, 0.02), 1.0, is_depth_observable=True)
     monkeypatch.setattr(refinement, "pair_noise", lambda *_: estimate)
     monkeypatch.setattr(refinement, "REESTIMATE_STEPS", 0)
