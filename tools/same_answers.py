@@ -100,6 +100,9 @@ def answers_of(tree: Path, args: argparse.Namespace) -> dict[str, Any]:
     if args.only:
         words += ["--only", args.only]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
+    # a kernel rounds otherwise in the process that has compiled it than where it was read
+    compile_all = [sys.executable, "-m", "hybridvo.compiled"]
+    subprocess.run(compile_all, cwd=tree, env=environment, check=True)
     done = subprocess.run(
         [sys.executable, __file__, *words],
         env=environment,
@@ -126,7 +129,7 @@ def answers(data: Path, names: list[str]) -> dict[str, Any]:
         sequence = hybridvo.open_sequence(data / recording.folder)
         tracker = hybridvo.Odometry(method=recording.method)
         steps = []
-        for index in range(recording.frames):
+        for index in range(min(recording.frames, len(sequence))):
             step = tracker.track(sequence[index])
             numbers = [step.T_world_cam, step.motion.T_curr_prev, step.covariance]
             if step.edge is not None:

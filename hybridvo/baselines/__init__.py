@@ -12,30 +12,15 @@ import importlib
 import cv2
 import numpy as np
 
-from hybridvo.baselines.clouds import REGISTRATIONS, estimate_by_clouds
-from hybridvo.baselines.correspondences import (
-    Correspondences,
-    sample,
-    with_covariance,
-)
-from hybridvo.baselines.features import estimate_by_features
-from hybridvo.baselines.images import ALIGNERS, estimate_by_images
-from hybridvo.baselines.solvers import SOLVERS, estimate_by_points
 from hybridvo.core.results import RelativePose, StageFailed
 from hybridvo.core.types import FramePair
 
-__all__ = (
-    "ALIGNERS",
-    "METHODS",
-    "REGISTRATIONS",
-    "SOLVERS",
-    "WITHOUT_FLOW",
-    "Correspondences",
-    "estimate",
-    "missing",
-    "sample",
-    "with_covariance",
-)
+SOLVERS = ("pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib")
+"""Point solvers."""
+ALIGNERS = ("opencv-rgbd", "open3d-rgbd")
+"""RGB-D odometry."""
+REGISTRATIONS = ("small-gicp", "kiss-icp")
+"""Registration of point clouds."""
 FEATURES = "sift-pnp"
 WITHOUT_FLOW = (*REGISTRATIONS, FEATURES)
 """Methods for which no flow is computed; RGB-D odometry takes it for its covariance alone."""
@@ -90,14 +75,16 @@ def estimate(
     Returns:
         The motion; failed where the data determine none.
     """
+    from hybridvo.baselines import clouds, features, images, solvers
+
     try:
         if method in REGISTRATIONS:
-            return estimate_by_clouds(method, pair, seed, start)
+            return clouds.estimate_by_clouds(method, pair, seed, start)
         if method == FEATURES:
-            return estimate_by_features(pair, seed)
+            return features.estimate_by_features(pair, seed)
         if method in ALIGNERS:
-            return estimate_by_images(ALIGNERS[method], pair, seed)
-        return estimate_by_points(method, pair, seed, inlier_px)
+            return images.estimate_by_images(method, pair, seed)
+        return solvers.estimate_by_points(method, pair, seed, inlier_px)
     except StageFailed as failure:
         return RelativePose.failed(
             failure.reason, str(failure), inlier_ratio=failure.inlier_ratio

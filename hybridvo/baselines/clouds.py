@@ -44,7 +44,6 @@ TRANSLATION_TOLERANCE = 1e-4
 """The same of the translation, in voxels."""
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]
 """Order of the tangent of small_gicp, in places of ours."""
-REGISTRATIONS = ("small-gicp", "kiss-icp")
 
 
 class Clouds(NamedTuple):

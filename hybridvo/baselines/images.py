@@ -89,13 +89,13 @@ ALIGNERS: dict[str, Aligner] = {
 }
 
 
-def estimate_by_images(align: Aligner, pair: FramePair, seed: int) -> RelativePose:
+def estimate_by_images(method: str, pair: FramePair, seed: int) -> RelativePose:
     """Align images and depth maps; flow serves for the check and the covariance."""
     images = _images(pair)
     max_depth = float(np.nanmax(images.depth[0])) + 1.0
     T = None
     with contextlib.suppress(*SOLVER_ERRORS):
-        T = align(images, pair.prev.camera, max_depth)
+        T = ALIGNERS[method](images, pair.prev.camera, max_depth)
     if T is not None:
         # both libraries chain small updates into not quite a rotation
         T = pose_matrix(T[:3]) if np.isfinite(T).all() else None

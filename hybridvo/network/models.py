@@ -35,13 +35,15 @@ def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
         CheckpointError: see :func:`hybridvo.network.weights.read_network`.
     """
     # torch is imported on first use: the method classical works without it
-    from hybridvo.network.paper.networks import NetworkOptions, build_network
-    from hybridvo.network.pwvo import PWVO, PWVOOptions
     from hybridvo.network.weights import read_network
 
     def make(options: dict[str, Any]) -> Any:
         if options.get("kind") == PWVO_KIND:
+            from hybridvo.network.pwvo import PWVO, PWVOOptions
+
             return PWVO(PWVOOptions(**options))
+        from hybridvo.network.paper.networks import NetworkOptions, build_network
+
         return build_network(NetworkOptions(**options))
 
     return read_network(name_or_path, make)

@@ -31,7 +31,6 @@ from hybridvo.network.hypothesis_inputs import (
 )
 from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
 from hybridvo.network.pair_maps import predict_batch, predict_pairs
-from hybridvo.network.paper.layers import scaled
 from hybridvo.network.weights import read_network_of
 from hybridvo.solver.torch.tools import checked_batch
 
@@ -48,6 +47,11 @@ MIRRORED_MOTION = (1, 2, 3)
 """Components of a motion that do so: ry, rz, tx."""
 MAX_CORRECTION = 20.0
 """Largest correction of a hypothesis, in units of what it leaves unexplained."""
+
+
+def scaled(channels: int, width: float) -> int:
+    """Number of channels at a width factor, at least one."""
+    return max(1, round(channels * width))
 
 
 @option_group

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,12 +21,12 @@ from hybridvo.tracking.keyframes import (
 )
 from hybridvo.tracking.memory import Memory, faded, memory_after
 from hybridvo.tracking.motion_model import MotionModel
-from hybridvo.tracking.object_motions import Earlier, View
-from hybridvo.tracking.objects import Objects
-from hybridvo.tracking.objects import after_step as objects_after
 from hybridvo.tracking.relocalization import with_place
 from hybridvo.tracking.setup import Setup
 from hybridvo.tracking.tracker_state import TrackerState
+
+if TYPE_CHECKING:
+    from hybridvo.tracking.objects import Objects
 
 # covariance of no motion, which a pose graph can still invert
 FIRST_FRAME_COVARIANCE = 1e-12 * np.eye(6)
@@ -263,7 +263,7 @@ class Arrival:
             state,
             motion_model=self._motion_model(motion),
             failed=0,
-            things=objects.things,
+            things=state.things if objects is None else objects.things,
             used_flow="flow" in motion.terms,
             memory=self._memory(),
         )
@@ -351,16 +351,18 @@ class Arrival:
             return self.state.memory
         return memory_after(self.state.memory, self.frame, estimate)
 
-    def _objects(self) -> Objects:
-        """What moves by itself, from the frame before on."""
+    def _objects(self) -> Objects | None:
+        """What moves by itself, from the frame before on; None where that is not sought."""
         estimate = self.estimate
-        things = self.state.things
         reference = estimate.reference
         is_wanted = self.setup.options.track.objects == "auto" and self.leads
         if not is_wanted or estimate.is_relocalized:
-            return Objects(things, ())
+            return None
         if not (self.frame.is_rgbd and reference.frame.is_rgbd):
-            return Objects(things, ())
+            return None
+        from hybridvo.tracking import objects
+        from hybridvo.tracking.object_motions import Earlier, View
+
         T_cam_world = invert(estimate.T_world_cam)
         starts = (*estimate.keyframes, estimate.start)
         oldest = min(starts, key=lambda keyframe: keyframe.count)
@@ -371,4 +373,6 @@ class Arrival:
         view = View(self.frame, before, far, estimate.motion.depth_noise)
         passed = self.state.count - reference.count
         context = self.setup.context
-        return objects_after(things, view, passed, context.options, context.seed)
+        return objects.after_step(
+            self.state.things, view, passed, context.options, context.seed
+        )

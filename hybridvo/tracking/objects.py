@@ -137,17 +137,22 @@ class _Ahead(NamedTuple):
 
 @stage("objects")
 def after_step(
-    things: Things, view: View, frames: int, options: Options, seed: int = 0
+    things: Things | None,
+    view: View,
+    frames: int,
+    options: Options,
+    seed: int = 0,
 ) -> Objects:
     """Return the objects after a frame whose camera motion is known.
 
     Args:
-        things: before the frame.
+        things: before the frame; None: none are known.
         view: the frame, and those before it.
         frames: number of frames since the frame before of the view.
         options: the option tree.
         seed: of the search.
     """
+    things = things or Things()
     ahead = [_ahead(thing, view, frames) for thing in things.known]
     expected = [
         Expected(each.T_curr_prev, each.cells, each.thing.age < NEW_OBJECT_FRAMES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,8 +22,10 @@ from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
-from hybridvo.tracking.objects import Things
 from hybridvo.tracking.stamps import Clock
+
+if TYPE_CHECKING:
+    from hybridvo.tracking.objects import Things
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +49,7 @@ class TrackerState:
     keyframes: tuple[Keyframe, ...] = ()  # oldest first
     places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
     memory: Memory | None = None  # which parts of the view are static
-    things: Things = field(default_factory=Things)  # what else moves
+    things: Things | None = None  # what else moves, where that is sought
     # how well the scale of all depths is known, where each frame has its own
     scale: ScaleFilter = field(default_factory=ScaleFilter)
     gyroscope: Gyroscope | None = None  # where samples were handed in
@@ -141,5 +144,5 @@ class TrackerState:
             keyframes=tuple(map(rescaled, self.keyframes)),
             places=tuple(map(rescaled, self.places)),
             memory=memory,
-            things=self.things.rescaled(factor),
+            things=None if self.things is None else self.things.rescaled(factor),
         )

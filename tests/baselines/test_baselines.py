@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo import baselines
 from hybridvo.api import estimate
-from hybridvo.baselines import (
-    SOLVERS,
+from hybridvo.baselines import missing
+from hybridvo.baselines.correspondences import (
     Correspondences,
-    missing,
     sample,
     with_covariance,
 )
+from hybridvo.baselines.solvers import SOLVERS
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import (
     ego_flow,

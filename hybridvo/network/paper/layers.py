@@ -16,6 +16,7 @@ from torch import nn
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import option_group
 from hybridvo.network.inputs import NetworkInputs
+from hybridvo.network.pwvo import scaled
 
 INPUT_LIMIT = 100.0
 """Limit of the inputs, so that activations cannot overflow: 20 000 px of flow, 1 cm."""
@@ -56,11 +57,6 @@ class NetworkOptions:
             raise InputError(
                 "the second decoder is the uncertainty's; without set decoders=1"
             )
-
-
-def scaled(channels: int, width: float) -> int:
-    """Number of channels at a width factor, at least one."""
-    return max(1, round(channels * width))
 
 
 class ResidualBlock(nn.Module):

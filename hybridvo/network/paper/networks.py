@@ -25,9 +25,9 @@ from hybridvo.network.paper.layers import (
     InputBranches,
     NetworkOptions,
     initialize,
-    scaled,
 )
 from hybridvo.network.paper.normalization import MotionScale, normalize
+from hybridvo.network.pwvo import scaled
 from hybridvo.network.weights import read_network_of
 
 # channels of the decoder at full width: of its last layers, and of those before
