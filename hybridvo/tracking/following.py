@@ -6,19 +6,13 @@ from dataclasses import dataclass, replace
 
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Frame
-from hybridvo.tracking.arrival import (
-    Outcome,
-    after_estimate,
-    bridged,
-    of_first_frame,
-)
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     divided,
     measured_scale,
 )
 from hybridvo.tracking.estimates import Estimate
-from hybridvo.tracking.estimator import Estimator, Query
+from hybridvo.tracking.fallbacks import bridged
 from hybridvo.tracking.one_time import frames_at_one_time
 from hybridvo.tracking.repeated import (
     Repeat,
@@ -26,7 +20,8 @@ from hybridvo.tracking.repeated import (
     motion_without_image,
 )
 from hybridvo.tracking.setup import Setup
-from hybridvo.tracking.tracker_state import TrackerState
+from hybridvo.tracking.tracker import Query, find, keep, of_first_frame
+from hybridvo.tracking.tracker_state import Outcome, TrackerState
 
 
 def outcome_of(
@@ -74,13 +69,11 @@ class _Following:
 
     def _estimate(self, query: Query) -> Estimate:
         """The motion to a frame."""
-        return Estimator(self.setup, self.state, query).estimate()
+        return find(self.setup, self.state, query)
 
     def _after(self, query: Query, frame: Frame, estimate: Estimate) -> Outcome:
         """The outcome of an estimate; ``frame`` is what later motions start from."""
-        return after_estimate(
-            self.setup, self.state, frame, estimate, query.flow is not None
-        )
+        return keep(self.setup, self.state, frame, estimate, query.flow is not None)
 
     def _without_image(self, query: Query, repeat: Repeat) -> Outcome | None:
         """The outcome of a frame by its depth, where that is fresh, or by what is expected.

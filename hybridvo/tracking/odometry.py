@@ -33,12 +33,12 @@ from hybridvo.flow.providers import (
 )
 from hybridvo.network.models import Models, default_models
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.arrival import fallback
-from hybridvo.tracking.estimator import Query
+from hybridvo.tracking.fallbacks import fallback
 from hybridvo.tracking.following import outcome_of
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.repeated import repeat_of
 from hybridvo.tracking.setup import Setup
+from hybridvo.tracking.tracker import Query
 from hybridvo.tracking.tracker_state import TrackerState
 
 _logger = logging.getLogger(__name__)

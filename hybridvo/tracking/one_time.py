@@ -13,9 +13,9 @@ from hybridvo.evidence.one_time import (
     pair_at_image_times,
     rough_motion,
 )
-from hybridvo.tracking.estimator import Estimator, Query
 from hybridvo.tracking.repeated import Repeat
 from hybridvo.tracking.setup import Setup
+from hybridvo.tracking.tracker import Query, find
 from hybridvo.tracking.tracker_state import TrackerState
 
 
@@ -73,7 +73,7 @@ def _rough_motion(
     def found_in(as_they_are: FramePair) -> np.ndarray | None:
         of_prev = state.starting_with(as_they_are.prev)
         of_curr = query._replace(frame=as_they_are.curr)
-        found = Estimator(setup, of_prev, of_curr).estimate()
+        found = find(setup, of_prev, of_curr)
         if not found.motion.usable:
             return None
         return invert(found.T_world_cam) @ state.T_world_cam

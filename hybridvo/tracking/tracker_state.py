@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hybridvo.core.geometry import invert
 from hybridvo.core.gravity import Gravity
-from hybridvo.core.results import MotionPrior
+from hybridvo.core.results import MotionPrior, RelativePose, Step
 from hybridvo.core.types import Frame
 from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.depth_scale import (
@@ -25,7 +25,7 @@ from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.stamps import Clock
 
 if TYPE_CHECKING:
-    from hybridvo.tracking.objects import Things
+    from hybridvo.tracking.objects import Objects, Things
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,3 +146,47 @@ class TrackerState:
             memory=memory,
             things=None if self.things is None else self.things.rescaled(factor),
         )
+
+
+class Outcome(NamedTuple):
+    """What follows from a frame."""
+
+    state: TrackerState
+    step: Step
+
+
+def advanced(
+    state: TrackerState,
+    frame: Frame,
+    T_world_cam: np.ndarray,
+    leads: bool,
+    is_sure: bool,
+) -> TrackerState:
+    """Return a state that counts a frame, and makes it the reference if it leads."""
+    state = replace(
+        state, T_world_last=T_world_cam, count=state.count + 1, by_depth=False
+    )
+    if not leads:
+        return replace(state, gap=state.gap + 1)
+    return replace(
+        state, frame=frame, T_world_cam=T_world_cam, gap=0, is_sure=is_sure
+    )
+
+
+def step_of(
+    frame: Frame,
+    T_world_cam: np.ndarray,
+    motion: RelativePose,
+    prev_index: int | None,
+    objects: Objects | None = None,
+) -> Step:
+    """The step of a frame, with a copy of its pose (4, 4)."""
+    seen = () if objects is None else objects.seen
+    return Step(
+        frame.index,
+        frame.timestamp,
+        T_world_cam.copy(),
+        motion,
+        prev_index,
+        objects=seen,
+    )

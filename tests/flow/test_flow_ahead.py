@@ -10,8 +10,8 @@ import pytest
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowAhead, FlowField
 from hybridvo.pipeline import Context
-from hybridvo.tracking.estimator import Estimator, Query
 from hybridvo.tracking.setup import Setup
+from hybridvo.tracking.tracker import Pairs, Query
 from hybridvo.tracking.tracker_state import TrackerState
 from tests import worlds
 
@@ -68,8 +68,8 @@ def test_only_our_flow_is_computed_ahead_and_only_where_it_is_expected(
 ):
     provider = Provider(source)
     setup = Setup("hybrid", Context(flow=provider))
-    state = TrackerState(used_flow=expects_flow)
+    state = TrackerState(frame(), used_flow=expects_flow)
     query = Query(frame(), flow=None, given=None, deadline=None)
-    with Estimator(setup, state, query).flow_ahead(frame()):
+    with Pairs(setup, state, query).flow_ahead():
         pass
     assert len(provider.threads) == calls
