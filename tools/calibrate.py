@@ -6,7 +6,8 @@ calibration.py of their rooms.
 
 Pairs of the makers of tools/maker_pairs.py that are for calibration, of which the training saw
 none, and scenes in which no part follows the camera. Each maker counts alike, however many
-pairs it has. Right is what tools/bench/semi_real.py calls so.
+pairs it has. Right is what tools/bench/semi_real.py calls so. What is printed of a maker is by a
+fit on all others.
 """
 
 from __future__ import annotations
@@ -373,39 +374,56 @@ def report(name: str, labelled: list[Labelled]) -> None:
     if not has_both:
         return
     evidence = np.array([row.evidence for row in labelled])
-    makers = [row.maker for row in labelled]
-    counts = maker_weights(makers)
-    ridge = RIDGE
-    if name == CHOICE:
-        is_moving = np.array([maker in MOVING_REAL for maker in makers])
-        counts = counts * np.where(is_moving, 1.0, STILL_WEIGHT)
-        counts /= counts.mean()
-        ridge = CHOICE_RIDGE
-    if name == DIRECT:
-        certainty = evidence[:, -1]
-        evidence = evidence[:, :-1]
-        exact, of_scene = fit_direct(evidence, certainty, right, counts)
-        print(f"  {digits_of(exact)}, {digits_of(of_scene)}")
-        is_of_scene = logistic(evidence[:, -1:], of_scene)
-        probability = logistic(evidence, exact)
-        probability *= where_known(certainty, is_of_scene)
-    else:
-        weights = fit(evidence, right, counts, ridge)
-        print(f"  {digits_of(weights)}")
-        probability = logistic(evidence, weights)
-    area = area_under_curve(probability, right)
-    error = calibration_error(probability, right)
-    print(f"  AUROC {area:.3f}, calibration error {error}")
-    for maker in sorted(set(makers)):
-        mine = np.array([one == maker for one in makers])
-        area = area_under_curve(probability[mine], right[mine])
-        error = calibration_error(probability[mine], right[mine])
-        print(f"    {maker}: {mine.sum()} answers, AUROC {area}, error {error}")
+    makers = np.array([row.maker for row in labelled])
+    weights = fit_of(name, evidence, right, makers)
+    print(f"  {', '.join(digits_of(each) for each in weights)}")
     limit = DIRECT_PROBABILITY if name == DIRECT else MIN_PROBABILITY
+    print(f"  all makers: {figures(stated(evidence, weights), right, limit)}")
+    left_out = np.full(len(right), np.nan)
+    for maker in sorted(set(makers)):
+        mine = makers == maker
+        if mine.all():
+            continue
+        others = fit_of(name, evidence[~mine], right[~mine], makers[~mine])
+        left_out[mine] = stated(evidence[mine], others)
+        print(f"  without {maker}: {figures(left_out[mine], right[mine], limit)}")
+    if not np.isnan(left_out).any():
+        print(f"  each left out: {figures(left_out, right, limit)}")
+
+
+def fit_of(
+    name: str, evidence: np.ndarray, right: np.ndarray, makers: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """The weights of one probability, or of the two of a direct motion."""
+    counts = maker_weights(list(makers))
+    if name == DIRECT:
+        return fit_direct(evidence[:, :-1], evidence[:, -1], right, counts)
+    if name != CHOICE:
+        return (fit(evidence, right, counts),)
+    is_moving = np.array([maker in MOVING_REAL for maker in makers])
+    counts = counts * np.where(is_moving, 1.0, STILL_WEIGHT)
+    return (fit(evidence, right, counts / counts.mean(), CHOICE_RIDGE),)
+
+
+def stated(evidence: np.ndarray, weights: tuple[np.ndarray, ...]) -> np.ndarray:
+    """(N,) probabilities by fitted weights, see :func:`fit_of`."""
+    if len(weights) == 1:
+        return logistic(evidence, weights[0])
+    exact, of_scene = weights
+    seen = evidence[:, :-1]
+    is_of_scene = logistic(seen[:, -1:], of_scene)
+    return logistic(seen, exact) * where_known(evidence[:, -1], is_of_scene)
+
+
+def figures(probability: np.ndarray, right: np.ndarray, limit: float) -> str:
+    """What is told of some answers (N,)."""
     is_sure = probability >= limit
-    flagged = (right & ~is_sure).sum()
-    missed = (~right & is_sure).sum()
-    print(f"  {flagged} right ones below, {missed} wrong ones above")
+    area = area_under_curve(probability, right)
+    return (
+        f"{len(right)} answers, {right.sum()} right, AUROC {area}, calibration error "
+        f"{calibration_error(probability, right)}, {(right & ~is_sure).sum()} right ones below, "
+        f"{(~right & is_sure).sum()} wrong ones above"
+    )
 
 
 def maker_weights(makers: list[str]) -> np.ndarray:

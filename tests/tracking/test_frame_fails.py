@@ -14,9 +14,9 @@ from tests.late_depth import rolling_frames
     ("room", "broken", "number"),
     [
         (one_time, "follow_roughly", 2),
-        (following, "after_estimate", 2),
+        (following, "keep", 2),
         # its stamp jumps back, so that no velocity is known
-        (following, "after_estimate", 0),
+        (following, "keep", 0),
     ],
 )
 def test_a_tracker_is_as_it_was(
