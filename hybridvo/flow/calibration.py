@@ -20,12 +20,6 @@ CONSISTENT_FLOW_RATIO = 0.05
 to which the flow is valid: the larger of the two counts. By hand."""
 MAX_FLOW_STD_PX = 5.0
 """Largest standard deviation of DIS flow that is stated, px. By hand."""
-DIS_PATCH_STRIDE = 4
-"""Distance of the patches of DIS (medium), px: as many answers are right as with 3, in three
-quarters of the time. By hand."""
-TEXTURE_SIDE_PX = 120
-"""Shorter side to which images are shrunk to measure their texture, px: that averages the
-noise of a sensor out. By hand; ``make golden`` shows the effect of a change."""
 FLOW_TEXTURE_GRADIENT = 2.0
 """Gradient, grey levels a pixel of an image of that size, that counts as texture. It was
 chosen by hand as 1.0, above the noise of a dark sensor, and became 2.0 when a later number
@@ -36,17 +30,9 @@ noise that neighbours share 0.8 to 1.3 (3.4 at 120 rows). In 52 folders of recor
 65, at a tenth of the brightness with noise of 5 grey levels 1.5 to 4.5. By hand, between them."""
 SHIFT_GRADIENT = 2.0
 """Gradient, grey levels a pixel, above which a shift of the image is visible. By hand."""
-COMPARED_SIDE_PX = 100
-"""Shorter side to which a pair is shrunk to compare it with its flow, px: details do not
-matter there. By hand."""
-MIN_COMPARED_PIXELS = 200
-"""Such pixels of a pair of that size, below which a flow is not compared with its images.
-By hand."""
 
 # Photometric refinement
 # Where no command is named: chosen by hand; ``make golden`` shows the effect.
 
-IMAGE_BLUR_PX = 1.0
-"""Standard deviation of the blur of both images, px."""
 UNSTATED_FLOW_STD_PX = 0.5
 """Taken for the standard deviation of an estimated flow that states none, px. True flow has 0."""

@@ -12,7 +12,9 @@ import numpy as np
 from hybridvo.compiled.numba_tools import as_contiguous, njit
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Camera, Frame
-from hybridvo.flow.calibration import IMAGE_BLUR_PX
+
+# Standard deviation of the blur of both images, px.
+IMAGE_BLUR_PX = 1.0
 
 # luma weights of red, green and blue
 RED = np.float32(0.299)

@@ -15,16 +15,21 @@ import numpy as np
 
 from hybridvo.core.geometry import agreement
 from hybridvo.core.results import Hypothesis, MotionPrior
-from hybridvo.hypotheses.calibration import (
-    BORDER_WIDTH,
-    CUE_MIN_DEPTH_STD,
-    CUE_MIN_INLIER_RATIO,
-    CUE_WEIGHTS,
-    MIN_INLIER_NOISE_PX,
-)
+from hybridvo.hypotheses.calibration import CUE_WEIGHTS
 from hybridvo.hypotheses.refit import MIN_TOTAL
 from hybridvo.solver import kernels
 from hybridvo.solver.pixels import PixelGrid
+
+# Smallest flow noise by which inliers are decided, px: below it all motions count as equally
+# sharp.
+MIN_INLIER_NOISE_PX = 0.05
+# Width of the band along the border of the image for the cue of border coverage, over the shorter
+# side of the image.
+BORDER_WIDTH = 0.06
+# Added to inlier ratios before their logarithm is a cue: none at all is finite.
+CUE_MIN_INLIER_RATIO = 0.01
+# Added in quadrature to the standard deviation of log depth before its logarithm is a cue.
+CUE_MIN_DEPTH_STD = 0.03
 
 
 class Cues(NamedTuple):

@@ -19,20 +19,23 @@ from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred, gradient_at
 from hybridvo.solver.calibration import (
     FLAT_GRADIENT,
-    LIGHT_SIDE,
     MAX_REGION_SHIFT_PX,
     MIN_FOLLOWING,
     MIN_SEEN_OF_REGION,
     NOISE_GREY,
     NOISE_SHIFT_PX,
     REGION_CUTOFF,
-    REGION_SIDE,
     SHOWN_SHIFT,
 )
 from hybridvo.solver.correlated_errors import MAD_TO_STD
 from hybridvo.solver.planes import PlaneFactor, PlanesAt
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PlaneRow
+
+# Sides of the squares, in points of the grid, over which the change of light is averaged and over
+# which a region is called explained or not.
+LIGHT_SIDE = 3
+REGION_SIDE = 5
 
 # guards divisions where no point is inside the image
 TINY = 1e-6

@@ -23,13 +23,19 @@ from hybridvo.flow.frame_images import grey_bytes, reduced
 from hybridvo.flow.providers import FlowField
 from hybridvo.hypotheses.calibration import (
     GUIDED_MIN_TEXTURE,
-    MATCH_FEATURES,
-    MATCH_MAX_MOTIONS,
     MATCH_MIN_INLIERS,
     MATCH_RATIO,
     MATCH_RESIDUAL_PX,
-    MATCH_WIDTH,
 )
+
+# SIFT features of an image, for a step that flow cannot follow: 40 ms on one core. Chosen by
+# hand, as all of this section; ``tools/benchmark.py wide_steps`` shows the effect of a change.
+MATCH_FEATURES = 800
+# Width to which images are reduced before features are matched, px: 35 ms instead of 90 for a
+# pair at 640x480, and as many wide steps are right (78 and 77 of 86).
+MATCH_WIDTH = 400.0
+# Motions of a pair that are sought: the scene's, and a moving object's before it.
+MATCH_MAX_MOTIONS = 2
 
 RANSAC_ITERATIONS = 300
 RANSAC_CONFIDENCE = 0.999

@@ -9,23 +9,47 @@ Poses are (3, 4) float64 ``T_curr_prev``; ``samples`` is a pixel buffer with the
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
-from hybridvo.hypotheses.calibration import (
-    BROAD_SCORE_PER_PX2,
-    CANDIDATE_ANNEALING,
-    CANDIDATE_MIN_START_PX,
-    GLOBAL_SAMPLE_PERIOD,
-    LOCAL_SAMPLE_HEIGHT,
-    LOCAL_SAMPLE_WIDTH,
-    MIN_PIXEL_WEIGHT,
-    MIN_WINDOW_PIXELS,
-    MIN_WINDOW_WEIGHT,
-    SHARP_SCORE_PER_PX2,
-)
+from hybridvo.hypotheses.calibration import BROAD_SCORE_PER_PX2, SHARP_SCORE_PER_PX2
 from hybridvo.solver import kernels, robust_fit
 from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MU, MV, XN, YN, W, Z
+
+
+class Annealing(NamedTuple):
+    """How the scale of a robust kernel shrinks during a fit.
+
+    Attributes:
+        start_px: first scale, px; where it follows from the residuals, its largest value.
+        end_px: last scale, px.
+        ratio: each scale over the one before.
+        steps: Gauss-Newton steps at each scale, at most.
+    """
+
+    start_px: float
+    end_px: float
+    ratio: float
+    steps: int
+
+
+# Of the fit of a window, and of a pose that the caller hands in.
+CANDIDATE_ANNEALING = Annealing(start_px=64.0, end_px=0.7, ratio=0.4, steps=2)
+# Smallest first scale of such a fit, px, even where the residuals are smaller.
+CANDIDATE_MIN_START_PX = 1.0
+# Weight of a pixel up to which a window leaves it out; 1 is that of an untouched one.
+MIN_PIXEL_WEIGHT = 0.05
+# Fewest pixels of a window that is fitted.
+MIN_WINDOW_PIXELS = 20
+# Smallest sum of the weights of such a window.
+MIN_WINDOW_WEIGHT = 12.0
+# One of so many minimal samples is drawn from all pixels, the others locally.
+GLOBAL_SAMPLE_PERIOD = 3
+# Region of a local sample about its first pixel, over the height and width of the image.
+LOCAL_SAMPLE_HEIGHT = 0.5
+LOCAL_SAMPLE_WIDTH = 0.4
 
 # windows are placed in so many rows and columns, and overlap by half
 WINDOW_ROWS = 3

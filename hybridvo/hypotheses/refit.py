@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.hypotheses.calibration import (
-    MASK_RAMP_END,
-    MASK_RAMP_START,
-)
+from hybridvo.hypotheses.calibration import MASK_RAMP_END, MASK_RAMP_START
 from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
 from hybridvo.solver import kernels
 from hybridvo.solver.pixels import PixelGrid

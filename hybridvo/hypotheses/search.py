@@ -16,23 +16,14 @@ import numpy as np
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.core.options import Options, SearchOptions
 from hybridvo.hypotheses.calibration import (
-    BEST_CANDIDATES_ANNEALING,
-    CANDIDATE_ANNEALING,
-    CANDIDATE_MIN_START_PX,
-    DISTINCT_MOTION_PX,
-    DUPLICATE_CANDIDATE,
-    FOUND_MOTION_ANNEALING,
     INLIER_REMOVAL_CUTOFF,
     INLIER_REMOVAL_GAIN,
-    MAX_PIXEL_DISTANCE_PX,
-    MIN_INLIER_NOISE_PX,
-    NEAR_START_PX,
-    NOISE_PIXELS,
     REESTIMATED_MIN_SCORE,
-    START_SCALE_FACTOR,
-    Annealing,
 )
 from hybridvo.hypotheses.proposals import (
+    CANDIDATE_ANNEALING,
+    CANDIDATE_MIN_START_PX,
+    Annealing,
     fit_minimal_samples,
     fit_windows,
     score_poses,
@@ -41,6 +32,24 @@ from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
 from hybridvo.solver import kernels, robust_fit
 from hybridvo.solver.kernels import FASTMATH, XN, YN, W, Z
 from hybridvo.solver.pixels import PixelGrid
+
+# Pixels from which the noise of a motion is estimated during the search, about.
+NOISE_PIXELS = 1000
+# First scale about a pose that is handed in, as a multiple of its median residual.
+START_SCALE_FACTOR = 1.5
+# First scale of a second fit about a pose that is handed in, px: where most of the image moves, a
+# wide kernel would leave even the right motion.
+NEAR_START_PX = 1.5
+# Of the candidates of a round that have the largest scores.
+BEST_CANDIDATES_ANNEALING = Annealing(start_px=1.5, end_px=0.7, ratio=0.4, steps=3)
+# Of a motion that won its round, before its noise is estimated.
+FOUND_MOTION_ANNEALING = Annealing(start_px=0.7, end_px=0.5, ratio=0.4, steps=3)
+# Largest difference between the entries of two poses that are one candidate: rad, and translation
+# over the typical depth.
+DUPLICATE_CANDIDATE = 2e-4
+# Largest difference of the ego flows of two motions at a pixel, px; also that of a pixel which
+# only one of them leaves in front of the camera.
+MAX_PIXEL_DISTANCE_PX = 1e3
 
 # minimal samples of the first round, and of each later one
 FIRST_MINIMAL_SAMPLES = 384

@@ -22,14 +22,17 @@ from hybridvo.core.results import (
     MotionPrior,
 )
 from hybridvo.hypotheses.calibration import (
-    CUE_MIN_INLIER_RATIO,
     DISTINCT_MOTION_PX,
-    MAX_SCORE_MARGIN,
     MIN_COVERAGE,
-    MIN_INLIER_NOISE_PX,
     NO_MOTION,
 )
-from hybridvo.hypotheses.cues import compute_cues, cue_scores, prior_scores
+from hybridvo.hypotheses.cues import (
+    CUE_MIN_INLIER_RATIO,
+    MIN_INLIER_NOISE_PX,
+    compute_cues,
+    cue_scores,
+    prior_scores,
+)
 from hybridvo.hypotheses.refit import (
     fit_in_mask,
     mask_coverage,
@@ -47,6 +50,9 @@ from hybridvo.judge.choice import (
 from hybridvo.solver import kernels
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.refine_flow import Selection
+
+# Margin of the best score where there is no other motion, and the largest that counts, nats.
+MAX_SCORE_MARGIN = 8.0
 
 
 class Candidate(NamedTuple):

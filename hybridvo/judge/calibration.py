@@ -37,15 +37,6 @@ texture that is left unexplained, and so without the second one, AUROC is .968, 
 .04, and 2011 of 5427 right ones fall below .95; each maker left out, .962 and 2094. By the standard
 deviation as a fraction of the ego flow, without films, a tenth of the sure motions of what was
 believed static were wrong in images of 160 columns."""
-LEAST_STD = 1e-5
-LEAST_FLOW = 0.0125
-LEAST_REGION_SHIFT = 0.3
-LEAST_UNEXPLAINED = 0.01
-"""What is added to the standard deviation of the ego flow and to its length, fractions of the
-image's width, to a shift of regions, standard errors, and to a fraction of the texture, before a
-logarithm is taken. By hand."""
-LEAST_SHARE = 0.01
-"""Fraction of the view that is added to a share before its logarithm is evidence. By hand."""
 DIRECT_PROBABILITY = 0.95
 """That from which no flow is computed. From .9 on, 14 instead of 7 steps of clips with large movers
 are wrong and ``ok`` (``tools/benchmark.py memory_unseen``, without memory), and two more escalators
@@ -80,9 +71,6 @@ NO_MOTION_PROBABILITY = 0.05
 """Probability of being right below which a motion is not applied to the path."""
 
 # Whether images and depth maps contradict a motion.
-
-CONSISTENT_WEIGHT = 0.5
-"""Robust weight of a pixel that an answer takes for static."""
 
 # -- depth that is rigid and false -------------------------------------------------------
 

@@ -18,12 +18,17 @@ from hybridvo.judge.calibration import (
     CUES_RIGHT,
     DIRECT_EXACT,
     DIRECT_OF_SCENE,
-    LEAST_FLOW,
-    LEAST_REGION_SHIFT,
-    LEAST_SHARE,
-    LEAST_STD,
-    LEAST_UNEXPLAINED,
 )
+
+# What is added to the standard deviation of the ego flow and to its length, fractions of the
+# image's width, to a shift of regions, standard errors, and to a fraction of the texture, before
+# a logarithm is taken.
+LEAST_STD = 1e-5
+LEAST_FLOW = 0.0125
+LEAST_REGION_SHIFT = 0.3
+LEAST_UNEXPLAINED = 0.01
+# Fraction of the view that is added to a share before its logarithm is evidence.
+LEAST_SHARE = 0.01
 
 
 class ChoiceEvidence(NamedTuple):

@@ -19,7 +19,6 @@ from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred
 from hybridvo.judge.calibration import (
     CLEAR_DEPTH_LEAD,
-    CONSISTENT_WEIGHT,
     CONTRADICTED_RIGHT,
     DEPTH_LEAD,
     DEPTH_LEAD_GAIN,
@@ -40,6 +39,9 @@ from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse
 from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
 from hybridvo.solver.rows import PlaneRow
+
+# Robust weight of a pixel that an answer takes for static.
+CONSISTENT_WEIGHT = 0.5
 
 # cells of the image, of which each gives one pixel or none
 IMAGE_PIXELS = 4000

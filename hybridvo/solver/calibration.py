@@ -7,8 +7,6 @@ log odds of the choice. Unfitted there: fitted on 458 answers beside a margin al
 # Below, without a unit: fitted on the development seeds of the scenarios
 # (``tools/benchmark.py methods``), on rendered walks with DIS flow, and on the real samples.
 
-FEW_TILES = 48
-"""With fewer tiles the correlation between errors is hardly known; more of it is then assumed."""
 CLUSTERED = 0.6
 """Fraction of the clustered matrix in the meat, the rest is that of independent errors scaled to
 the same mean. Alone the few blocks make weak directions too certain at times (4 of 420 pairs)."""
@@ -65,13 +63,6 @@ plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
 #
 # Where no command is named: chosen by hand; ``make golden`` shows what a change does.
 
-KERNEL_CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
-"""c of the other kernels, standard deviations: 95 % efficient under normal noise (Holland and
-Welsch, 1977). The one of ``l2`` has no effect."""
-SCALE_PER_RESIDUAL = 1.5
-"""First scale of the robust kernel, in medians of the residuals' lengths."""
-LARGEST_SCALE_PX = 64.0
-"""Largest first scale of the robust kernel, px."""
 SEED_STDS = 2.0
 """Largest first scale of the robust kernel from a seed, in standard deviations of where it puts
 the pixels, by the covariance that its giver states. Unfitted."""
@@ -81,12 +72,6 @@ before the images with it, 20 from about 2 px, 23 from ``SCALE_PER_RESIDUAL`` me
 SEED_FRACTION = 0.05
 """Unless fewer of the surest pixels than this fraction fit the seed so well: then it is off by as
 much as their residuals show. Unfitted."""
-SMALLEST_SCALE_PX = 0.4
-"""Last scale of the robust kernel before the noise is estimated, px."""
-COARSE_SCALE_RATIO = 0.5
-"""Factor from one scale to the next in the coarse fit of a pair."""
-BATCH_SCALE_RATIO = 0.7
-"""The same in the fit of a batch, which makes one step at each scale instead of up to three."""
 FLOW_NOISE_CAP_PX = 1.2
 """Largest noise of the flow that a single motion may have during a search, px."""
 DEPTH_NOISE_CAP = 0.08
@@ -101,13 +86,6 @@ DEPTHS_PER_PAIR = 1.32
 """Noise of the log ratio of two depth maps, as a multiple of that of one: sqrt(2), less what
 the interpolation of the current map averages away. ``tests/solver/test_covariance.py`` holds
 the result to 20 % of the true noise."""
-FINAL_NOISE_PIXELS = 4000
-"""Pixels from which the noise of the answer is estimated, about."""
-FINAL_NOISE_ROUNDS = 30
-"""Most rounds of expectation-maximisation of the answer's noise."""
-FLOW_NOISE_FLOOR_PX = 2e-3
-"""Smallest noise of the flow, px: float32 coordinates of an image 8000 pixels wide are good to
-5e-4 px."""
 MIN_DEPTH_NOISE_CAP = 0.02
 """Smallest cap on the noise of log depth of the answer."""
 OUTLIER_RADIUS_PX = 4.0
@@ -118,49 +96,12 @@ COHERENCE_CUTOFF = 4.0
 """Length of a whitened residual, standard deviations, beyond which it is left out of the blocks."""
 SURFACE = 0.05
 """Largest relative difference between four neighbours of a depth map that are one surface."""
-COARSE_STEPS = 3
-"""Gauss-Newton steps at each scale of the coarse fit."""
-REESTIMATE_ROUNDS = 2
-"""How often noise and motion are estimated in turn."""
-REESTIMATE_NOISE_ROUNDS = 5
-"""Rounds of expectation-maximisation each time."""
-REESTIMATE_STEPS = 4
-"""Gauss-Newton steps each time, and once more when the noise of the answer is known."""
-SCALE_TOLERANCE = 0.1
-"""Length of the last step at a scale of the robust kernel, as a fraction of that scale."""
-NOISE_TOLERANCE = 1e-3
-"""Length of the last step with known noise, in standard deviations of the flow."""
-NOISE_CHANGE = 1e-3
-"""Relative change of both variances below which the rounds of their estimate end."""
-MIN_NOISE_PIXELS = 8
-"""Smallest number of pixels from which a noise is estimated."""
-FIRST_INLIER_RATIO = 0.7
-SMALLEST_INLIER_RATIO = 0.01
-LARGEST_INLIER_RATIO = 0.999
-"""Fraction of the pixels that follow the motion, before the first round of the noise's
-estimate, and its limits."""
-START_FLOW_NOISE_PX = 0.5
-"""Noise of the flow from which its estimate starts, px."""
-START_DEPTH_NOISE = 0.01
-"""Noise of log depth from which its estimate starts."""
-TYPICAL_QUANTILE = 0.2
-"""Quantile of the variances of an image that is their unit, the typical variance."""
-MAX_DEPTH_SHIFT = 0.3
-"""Largest correction of a log depth: the linearization in log depth holds no farther."""
-BATCH_STEPS = 20
-"""Most Newton steps on all pixels of a batch."""
-BATCH_FIT_STEPS = 6
-"""Gauss-Newton steps of a fit to the pixels that a network is sure of."""
-BATCH_NOISE_STEPS = (2, 3, 3, 0)
-"""Gauss-Newton steps after each estimate of the noise of a batch."""
 RIVAL_WEIGHT = 0.25
 """Robust weight from which a pixel follows a motion, where its rivals are counted."""
 RIVAL_SCALES = 3.0
 """Width of the robust kernel with which they are counted, in last scales."""
 FOLLOWING_WEIGHT = 0.3
 """Robust weight from which a pixel follows a motion, where both depths are compared."""
-MIN_USABLE_RATIO = 0.05
-"""Fraction of a grid's pixels that must be usable; with fewer the grid is made finer."""
 MIN_INLIER_RATIO = 0.02
 """Fraction of the pixels that must follow a motion; with fewer the estimate fails."""
 MIN_ROBUST_SUM = 6
@@ -169,36 +110,6 @@ MIN_COMPARED_DEPTHS = 100
 """Points with a depth in both frames, below which the depth maps are not compared."""
 MIN_DEPTH_NOISE_POINTS = 50
 """Such points, below which the noise of depth is not estimated from them."""
-MIN_TILE_PX = 8
-MAX_TILE_PX = 64
-"""Smallest and largest side of a tile of the covariance, px."""
-STEP_TOLERANCE_STD = 30.0
-"""Length of the Newton step from the coarse grid's solution to that of all pixels of a pair,
-standard deviations: of 114 real pairs none was longer. Convergence is quadratic: what such a step
-leaves is a tenth of a standard deviation."""
-BATCH_STEP_TOLERANCE_STD = 4.0
-"""The same of a batch."""
-ROUNDED_STEP_STD = 0.05
-"""Mean motion of the image, standard deviations, below which a step may be rounding: of a batch,
-where it is not half as long as the shortest before it; of a pair, its only one."""
-MAX_STEP_RATIO = 4.0
-"""A step of a batch is taken if delta^T H delta is at most so many times its predicted
-decrease: 1 / ``MIN_DECREASE``."""
-MAX_EXACT_STEP_RATIO = 100.0
-"""The same near a solution that the gradient needs exactly: there the full derivative may be
-much flatter than H, and is right."""
-EXACT_PERIOD = 3
-"""Steps of a batch between two exact derivatives."""
-FIRST_BATCH_STEPS = 3
-"""First steps of a batch with exact derivatives, none of which ends it as rounding."""
-BEHIND_DISTANCE2 = 1e8
-"""Squared distance, in standard deviations, that a pixel behind the camera is charged: under the
-kernel of Geman-McClure, in single precision, as much as any outlier can cost."""
-MIN_CURVATURE_RATIO = 0.2
-"""Smallest eigenvalue of the full second derivative, as a fraction of that of Gauss-Newton's
-matrix, with which the curvature of the robust weights is believed: with few inliers it is noise."""
-SMALLEST_LEFT_OVER = 0.25
-"""Smallest fraction of the scores' variance that the fit is taken to leave in blocks of tiles."""
 
 # Photometric refinement
 # Where no command is named: chosen by hand; ``make golden`` shows the effect.
@@ -219,10 +130,6 @@ IMAGE_INFLATION = 4.0
 tiles as well."""
 PRIOR_FREEDOM = 6.0
 """Degrees of freedom of the Student kernel of a prior motion, whose covariance is an estimate."""
-MIN_ROUND_STD = 0.3
-"""Standard deviations by which a round of the photometric refinement moves the motion at least, or
-it was the last one: the round after it moves by a tenth to a quarter of that (median of five
-recordings)."""
 MIN_IMAGE_CORRELATION = 0.5
 """Weighted correlation of the two images along a motion, below which they do not match."""
 MIN_IN_VIEW = 0.3
@@ -234,31 +141,12 @@ MIN_IMAGE_GAIN = 0.2
 MAX_IMAGE_GAIN = 5.0
 """Smallest and largest gain of the current image over the previous one: exposure
 changes by less."""
-GREY_NOISE_FLOOR = 0.1
-"""Smallest standard deviation of the photometric residual, grey levels: rounding to 8 bits leaves
-0.08 after the blur."""
-IMAGE_TOLERANCE = 0.1
-"""Length of the last step on images and depth maps, in standard deviations."""
-COMPARED_PARTS = ((2, 2), (4, 1))
-"""Rows and columns of the parts into which an image is cut to see whether they agree
-(:data:`EVEN_PARTS`): a lens errs by quadrant, a rolling shutter by row."""
-ROBUST_CURVATURE = 0.6
-"""Second derivative of the Geman-McClure cost at its minimum over the sum of its weights: 0.73 for
-normal residuals, less with outliers. A Newton step divides by it."""
-MIN_PATCH_AREA = 1e-3
-"""Area in the current image, px, of a pixel of the previous one, below which its surface is viewed
-edge-on and its gradient is not carried over."""
 PLANE_REACH_PX = 3
 """Distance to the four neighbours that span the plane at a pixel of a depth map, px: the steps of a
 structured-light sensor are wider than one pixel."""
 PLANE_EDGE = 0.1
 """Relative difference of depth to such a neighbour beyond which the pixel lies at an edge and has
 no plane."""
-PLANE_NOISE_FLOOR = 1e-4
-"""Smallest standard deviation of a distance to a plane, as a fraction of the depth."""
-MIN_DEPTH_EIGENVALUE = 1e-3
-"""Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below
-which they do not determine a direction of the motion."""
 
 # The motion by images and depth maps alone, without flow.
 
@@ -272,10 +160,6 @@ and by noise, grey levels (standard deviations)."""
 MIN_FOLLOWING = 0.5
 """Product of the two robust factors of a point, by grey value and by depth, above which it follows
 the motion."""
-LIGHT_SIDE = 3
-REGION_SIDE = 5
-"""Sides of the squares, in points of the grid, over which the change of light is averaged and over
-which a region is called explained or not."""
 FLAT_GRADIENT = 2.0
 """Gradient, grey levels a pixel, whose texture counts half: a smooth surface looks the same
 wherever it went."""
@@ -301,14 +185,6 @@ MIN_BELIEVED = 0.5
 # Chosen on the box clips and a few kitchen clips, with the prototype that
 # ``tools/benchmark.py pwvo_parts`` measures today.
 
-PATCHES = 48
-"""About how many patches an image has. With 192 and with 12 the fused pose is as good on some clips
-and worse on others."""
-PATCH_PIXELS = 20_000
-"""About how many pixels of an image its patches have. Unfitted."""
-PATCH_SCALES = (4.0, 2.0, 1.0, 1.0)
-"""Width of the robust kernel in each pass over the patches, in flow noises of the hypothesis. From
-3 px beside it, the fused pose comes back on all heavy pairs and 20 of 21 kitchen ones."""
 PATCH_PRIOR_RAD = 0.05
 """Standard deviation of a patch's pose where its pixels leave it open, as an angle. Unfitted."""
 AGREEMENT_CUTOFF = 2.0

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.core.results import UNINFORMATIVE_COVARIANCE
-from hybridvo.solver.calibration import MIN_CURVATURE_RATIO
 from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.kernels import HESSIAN_SUMS
 from hybridvo.solver.newton import positive_inverse
@@ -31,6 +30,11 @@ from hybridvo.solver.shared_errors import (
     parts_of_tiles,
     shared_covariance,
 )
+
+# Smallest eigenvalue of the full second derivative, as a fraction of that of Gauss-Newton's
+# matrix, with which the curvature of the robust weights is believed: with few inliers it is
+# noise.
+MIN_CURVATURE_RATIO = 0.2
 
 # The information is definite if its smallest eigenvalue is larger than this, and than this fraction
 # of the largest.

@@ -17,12 +17,9 @@ from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import FramePair
-from hybridvo.solver.calibration import (
-    MIN_FOLLOWING,
-    MIN_STATIC_WEIGHT,
-    ROBUST_CURVATURE,
-)
+from hybridvo.solver.calibration import MIN_FOLLOWING, MIN_STATIC_WEIGHT
 from hybridvo.solver.covariance import covariance_of_sources
+from hybridvo.solver.newton import ROBUST_CURVATURE
 from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
 from hybridvo.solver.rows import PlaneRow
 

@@ -16,9 +16,9 @@ import numpy as np
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.frame_images import blurred
-from hybridvo.solver.calibration import GREY_NOISE_FLOOR, IMAGE_TOLERANCE
 from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.image_kernels import (
+    GREY_NOISE_FLOOR,
     Images,
     compare_images,
     fill_pixels,
@@ -41,6 +41,9 @@ from hybridvo.solver.rows import (
     ImageRow,
     PixelRow,
 )
+
+# Length of the last step on images and depth maps, in standard deviations.
+IMAGE_TOLERANCE = 0.1
 
 # guards a division where no pixel has weight
 TINY = 1e-12

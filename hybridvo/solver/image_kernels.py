@@ -21,10 +21,8 @@ from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
     EVEN_PARTS,
-    GREY_NOISE_FLOOR,
     MAX_IMAGE_GAIN,
     MIN_IMAGE_GAIN,
-    MIN_PATCH_AREA,
     SHARED_SHIFT,
 )
 from hybridvo.solver.correlated_errors import (
@@ -37,6 +35,13 @@ from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, ONE, ZERO
 from hybridvo.solver.newton_kernels import DAMPING, solve_definite
 from hybridvo.solver.products import add_products
 from hybridvo.solver.rows import IMAGE_ROWS, IMAGE_TERMS, ImageRow, PixelRow
+
+# Smallest standard deviation of the photometric residual, grey levels: rounding to 8 bits leaves
+# 0.08 after the blur.
+GREY_NOISE_FLOOR = 0.1
+# Area in the current image, px, of a pixel of the previous one, below which its surface is viewed
+# edge-on and its gradient is not carried over.
+MIN_PATCH_AREA = 1e-3
 
 # pixels this close to the border are not read, because reading needs neighbours
 MARGIN = 3

@@ -25,10 +25,12 @@ import numpy as np
 from numba.extending import register_jitable
 
 from hybridvo.compiled.numba_tools import njit, noinline
-from hybridvo.solver.calibration import (
-    BEHIND_DISTANCE2,
-    MAX_DEPTH_SHIFT,
-)
+
+# Largest correction of a log depth: the linearization in log depth holds no farther.
+MAX_DEPTH_SHIFT = 0.3
+# Squared distance, in standard deviations, that a pixel behind the camera is charged: under the
+# kernel of Geman-McClure, in single precision, as much as any outlier can cost.
+BEHIND_DISTANCE2 = 1e8
 
 # nnan and ninf are missing: the kernels test for invalid values
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}

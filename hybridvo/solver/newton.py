@@ -14,11 +14,6 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from hybridvo.solver.calibration import (
-    MAX_TILE_PX,
-    MIN_TILE_PX,
-    ROBUST_CURVATURE,
-)
 from hybridvo.solver.newton_kernels import (
     DAMPING,
     add_equations,
@@ -28,6 +23,13 @@ from hybridvo.solver.newton_kernels import (
     newton_step,
     raised,
 )
+
+# Smallest and largest side of a tile of the covariance, px.
+MIN_TILE_PX = 8
+MAX_TILE_PX = 64
+# Second derivative of the Geman-McClure cost at its minimum over the sum of its weights: 0.73 for
+# normal residuals, less with outliers. A Newton step divides by it.
+ROBUST_CURVATURE = 0.6
 
 # A step that raises the cost is kept all the same where the square of the next one is smaller than
 # this fraction of its own: noise may move the root of the gradient off the minimum.

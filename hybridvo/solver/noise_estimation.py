@@ -15,25 +15,36 @@ from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
     DEPTH_NOISE_CAP,
     DEPTHS_PER_PAIR,
-    FINAL_NOISE_PIXELS,
-    FINAL_NOISE_ROUNDS,
-    FIRST_INLIER_RATIO,
-    FLOW_NOISE_FLOOR_PX,
-    LARGEST_INLIER_RATIO,
     MIN_DEPTH_NOISE_CAP,
-    MIN_NOISE_PIXELS,
     NOISE_CAP_FACTOR,
-    NOISE_CHANGE,
     OBSERVABLE_DEPTH_NOISE_STD,
     OUTLIER_RADIUS_PX,
     OUTLIER_RADIUS_STD,
-    SMALLEST_INLIER_RATIO,
-    START_DEPTH_NOISE,
-    START_FLOW_NOISE_PX,
     USUAL_DEPTH_NOISE,
 )
 from hybridvo.solver.depths import depth_noise
 from hybridvo.solver.kernels import FASTMATH, NO_PARALLAX2, ONE, PD, PF, ZERO, W
+
+# Pixels from which the noise of the answer is estimated, about.
+FINAL_NOISE_PIXELS = 4000
+# Most rounds of expectation-maximisation of the answer's noise.
+FINAL_NOISE_ROUNDS = 30
+# Smallest noise of the flow, px: float32 coordinates of an image 8000 pixels wide are good to
+# 5e-4 px.
+FLOW_NOISE_FLOOR_PX = 2e-3
+# Relative change of both variances below which the rounds of their estimate end.
+NOISE_CHANGE = 1e-3
+# Smallest number of pixels from which a noise is estimated.
+MIN_NOISE_PIXELS = 8
+# Fraction of the pixels that follow the motion, before the first round of the noise's estimate,
+# and its limits.
+FIRST_INLIER_RATIO = 0.7
+SMALLEST_INLIER_RATIO = 0.01
+LARGEST_INLIER_RATIO = 0.999
+# Noise of the flow from which its estimate starts, px.
+START_FLOW_NOISE_PX = 0.5
+# Noise of log depth from which its estimate starts.
+START_DEPTH_NOISE = 0.01
 
 # Pixels that are compared with the current depth.
 COMPARED_PIXELS = 1000

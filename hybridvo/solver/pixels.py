@@ -14,10 +14,6 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.solver import kernels
-from hybridvo.solver.calibration import (
-    MIN_USABLE_RATIO,
-    TYPICAL_QUANTILE,
-)
 from hybridvo.solver.kernels import (
     GridCamera,
     PixelMaps,
@@ -26,6 +22,11 @@ from hybridvo.solver.kernels import (
     TileSums,
     TypicalVariance,
 )
+
+# Quantile of the variances of an image that is their unit, the typical variance.
+TYPICAL_QUANTILE = 0.2
+# Fraction of a grid's pixels that must be usable; with fewer the grid is made finer.
+MIN_USABLE_RATIO = 0.05
 
 # The typical variance is a quantile of every n-th pixel's, in both directions.
 TYPICAL_STRIDE = 7

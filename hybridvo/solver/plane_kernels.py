@@ -15,7 +15,6 @@ from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
     MIN_PLANE_POINTS,
     PLANE_EDGE,
-    PLANE_NOISE_FLOOR,
     PLANE_REACH_PX,
     SHARED_DEPTH_ERROR,
 )
@@ -35,6 +34,9 @@ from hybridvo.solver.rows import (
     PLANE_TERMS,
     PlaneRow,
 )
+
+# Smallest standard deviation of a distance to a plane, as a fraction of the depth.
+PLANE_NOISE_FLOOR = 1e-4
 
 REACH = PLANE_REACH_PX
 EDGE = np.float32(PLANE_EDGE)

@@ -19,11 +19,7 @@ from hybridvo.core.geometry import valid_depth
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
-from hybridvo.solver.calibration import (
-    MIN_DEPTH_EIGENVALUE,
-    MIN_EQUAL_DEPTHS,
-    QUANTUM_PERCENTILE,
-)
+from hybridvo.solver.calibration import MIN_EQUAL_DEPTHS, QUANTUM_PERCENTILE
 from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.newton import (
     Linearization,
@@ -40,6 +36,10 @@ from hybridvo.solver.plane_kernels import (
 from hybridvo.solver.points import points_of
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
+
+# Ratio to the largest eigenvalue of the (scaled) information of the depth maps, below which they
+# do not determine a direction of the motion.
+MIN_DEPTH_EIGENVALUE = 1e-3
 
 # points on a regular grid, at most
 POINTS = 5000

@@ -19,12 +19,6 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.types import FramePair
 from hybridvo.solver import kernels, robust_fit
-from hybridvo.solver.calibration import (
-    NOISE_TOLERANCE,
-    REESTIMATE_STEPS,
-    ROUNDED_STEP_STD,
-    STEP_TOLERANCE_STD,
-)
 from hybridvo.solver.covariance import (
     MotionCovariance,
     ScoreStatistics,
@@ -45,6 +39,7 @@ from hybridvo.solver.newton import (
 )
 from hybridvo.solver.noise_estimation import Noise, NoiseEstimate, pair_noise
 from hybridvo.solver.pixels import PixelGrid, coarse_grid
+from hybridvo.solver.robust_fit import NOISE_TOLERANCE, REESTIMATE_STEPS
 from hybridvo.solver.score_blocks import symmetric
 from hybridvo.solver.shared_errors import (
     SharedErrors,
@@ -52,6 +47,12 @@ from hybridvo.solver.shared_errors import (
     tile_pulls,
 )
 from hybridvo.solver.status import FitSummary, degeneracy, status_of
+from hybridvo.solver.torch.newton import ROUNDED_STEP_STD
+
+# Length of the Newton step from the coarse grid's solution to that of all pixels of a pair,
+# standard deviations: of 114 real pairs none was longer. Convergence is quadratic: what such a
+# step leaves is a tenth of a standard deviation.
+STEP_TOLERANCE_STD = 30.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.calibration import (
     FLOW_PRIOR_INFLATION,
     MIN_ADDED_INFORMATION,
-    MIN_ROUND_STD,
     MIN_STATIC_WEIGHT,
     MIN_TEXTURED_PIXELS,
 )
@@ -29,6 +28,11 @@ from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse
 from hybridvo.solver.planes import PlaneFactor, PlanesAt
 from hybridvo.solver.prior import Prior
+
+# Standard deviations by which a round of the photometric refinement moves the motion at least, or
+# it was the last one: the round after it moves by a tenth to a quarter of that (median of five
+# recordings).
+MIN_ROUND_STD = 0.3
 
 # times at most that noise and information are estimated anew, and Newton steps under each
 # estimate

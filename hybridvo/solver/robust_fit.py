@@ -11,21 +11,7 @@ import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.solver import kernels
-from hybridvo.solver.calibration import (
-    COARSE_SCALE_RATIO,
-    COARSE_STEPS,
-    DEPTH_NOISE_CAP,
-    FINAL_NOISE_PIXELS,
-    FLOW_NOISE_CAP_PX,
-    LARGEST_SCALE_PX,
-    NOISE_TOLERANCE,
-    REESTIMATE_NOISE_ROUNDS,
-    REESTIMATE_ROUNDS,
-    REESTIMATE_STEPS,
-    SCALE_PER_RESIDUAL,
-    SCALE_TOLERANCE,
-    SMALLEST_SCALE_PX,
-)
+from hybridvo.solver.calibration import DEPTH_NOISE_CAP, FLOW_NOISE_CAP_PX
 from hybridvo.solver.kernels import (
     COST,
     HESSIAN_SUMS,
@@ -42,10 +28,32 @@ from hybridvo.solver.newton_kernels import (
     solve_definite,
 )
 from hybridvo.solver.noise_estimation import (
+    FINAL_NOISE_PIXELS,
     START_NOISE,
     Noise,
     estimate_noise,
 )
+
+# First scale of the robust kernel, in medians of the residuals' lengths.
+SCALE_PER_RESIDUAL = 1.5
+# Largest first scale of the robust kernel, px.
+LARGEST_SCALE_PX = 64.0
+# Last scale of the robust kernel before the noise is estimated, px.
+SMALLEST_SCALE_PX = 0.4
+# Factor from one scale to the next in the coarse fit of a pair.
+COARSE_SCALE_RATIO = 0.5
+# Gauss-Newton steps at each scale of the coarse fit.
+COARSE_STEPS = 3
+# How often noise and motion are estimated in turn.
+REESTIMATE_ROUNDS = 2
+# Rounds of expectation-maximisation each time.
+REESTIMATE_NOISE_ROUNDS = 5
+# Gauss-Newton steps each time, and once more when the noise of the answer is known.
+REESTIMATE_STEPS = 4
+# Length of the last step at a scale of the robust kernel, as a fraction of that scale.
+SCALE_TOLERANCE = 0.1
+# Length of the last step with known noise, in standard deviations of the flow.
+NOISE_TOLERANCE = 1e-3
 
 # Pixels from which the length of a typical residual is taken.
 SCALE_PIXELS = 1000

@@ -13,14 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridvo.solver.calibration import (
-    ABSORBED,
-    CLUSTERED,
-    FEW_TILES,
-    LONG_GROWTH,
-    SMALLEST_LEFT_OVER,
-)
+from hybridvo.solver.calibration import ABSORBED, CLUSTERED, LONG_GROWTH
 from hybridvo.solver.kernels import HESSIAN_SUMS
+
+# With fewer tiles the correlation between errors is hardly known; more of it is then assumed.
+FEW_TILES = 48
+# Smallest fraction of the scores' variance that the fit is taken to leave in blocks of tiles.
+SMALLEST_LEFT_OVER = 0.25
 
 # Rows and columns of the 21 upper-triangle values of a symmetric matrix.
 UPPER = np.triu_indices(6)

@@ -19,8 +19,6 @@ from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
     COHERENCE_CUTOFF,
     COHERENT_STDS,
-    COMPARED_PARTS,
-    FLOW_NOISE_FLOOR_PX,
     SHARED_BLOCK,
 )
 from hybridvo.solver.kernels import (
@@ -36,7 +34,12 @@ from hybridvo.solver.kernels import (
     W,
     WorkRow,
 )
+from hybridvo.solver.noise_estimation import FLOW_NOISE_FLOOR_PX
 from hybridvo.solver.pixels import GridShape
+
+# Rows and columns of the parts into which an image is cut to see whether they agree
+# (:data:`EVEN_PARTS`): a lens errs by quadrant, a rolling shutter by row.
+COMPARED_PARTS = ((2, 2), (4, 1))
 
 # Flow along each axis of the image, and log depth.
 SHARED_ERRORS = 3

@@ -19,9 +19,12 @@ from hybridvo.tracking.calibration import (
     FIRST_ACCELERATION_S,
     GYRO_HOLD_S,
     MIN_ACCELERATION_STD,
-    STANDARD_GRAVITY,
-    UNKNOWN_FORCE_STD,
 )
+
+# What an accelerometer at rest reads, m/s^2; over the earth it differs by .3 per cent.
+STANDARD_GRAVITY = 9.80665
+# Standard deviation of the force along each axis before the first sample, m/s^2: unknown.
+UNKNOWN_FORCE_STD = 1e3
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,6 @@ keyframe alone gives 0.5; what interpolation, light and moving things add hardly
 to frame. By the translation of six recordings of a camera that stands 0.72 in the median (0.08 to
 0.88), of nine kinds of rendered video 0.75 to 0.94 (``correlation`` of ``tools/benchmark.py methods
 --parts video_rate``)."""
-PLACES = 10
-"""Earlier frames that are kept to find a lost path again. By hand."""
 PLACE_DISTANCE = 0.2
 """Mean ego flow between two places at least, as a fraction of the image's width: ten cover about
 two views, and matches bridge more than that (``tools/benchmark.py wide_steps``). By hand."""
@@ -30,12 +28,8 @@ and none is believed. By hand: each costs a motion."""
 CHANGE_DECAY = 0.9
 """Factor on the weight of earlier changes of the motion with every new one. By hand, as the
 next three; ``make golden`` shows the effect of a change."""
-MIN_CHANGES = 3
-"""Changes of the motion; with fewer their standard deviation is not known yet."""
 CHANGE_INFLATION = 2.0
 """Factor on the mean square of the changes in the prior: a larger one may come."""
-MIN_CHANGE_STD = 1e-3
-"""Smallest standard deviation of a change, m and rad: no camera repeats its motion exactly."""
 
 # -- depth whose scale changes from frame to frame ---------------------------------------
 
@@ -53,11 +47,6 @@ differ by 2.3 % (2.7 %, 2.3 %)."""
 
 # -- a focal length that is off ----------------------------------------------------------
 
-MIN_CAMERA_STEPS = 30
-"""Motions before which nothing is stated of the focal length or of the readout. Unfitted."""
-CAMERA_SIGMAS = 3.0
-"""Standard deviations by which a readout must differ from 0 before it is used, and a focal length
-from what is allowed before it is off. Unfitted."""
 MIN_TURN_PX = 0.5
 """Turn of a motion, px at the middle of the view, below which it is not asked about the camera:
 what it shows grows with the turn, and that of a shutter with its square. Unfitted."""
@@ -76,27 +65,12 @@ MAX_READOUT_STD_MS = 8.0
 MIN_STATIC_SHARE = 0.7
 """Fraction of the pixels that follow a motion, above which all of the view shows the readout: the
 rest are outliers of its fit. Unfitted."""
-MAX_EVEN_MS = 100.0
-"""Time between two frames, ms, up to which a hand turns a camera evenly. Unfitted."""
 
 # -- depth that is measured later than its image ----------------------------------------------
 
 MIN_TURN_GROWTH = 0.01
 """By how much a turn from frame to frame must grow in a second, rad, to show that depth is late: a
 lag of 10 ms then turns depth by a hundredth of a degree. Unfitted."""
-MIN_LAG_PAIRS = 20
-"""Pairs before which nothing is stated of the lag. Unfitted."""
-BEND_CUTOFF = 2.0
-"""Standard deviations from which a pair counts less in the mean of what pairs show of lag or
-readout. Unfitted."""
-MAX_LAG_STD_MS = 4.0
-"""Standard deviation of the lag, ms, from which on it is not known: a D435 turned to and fro for
-three seconds shows it to 2 or 4 (``hybridvo doctor DIR``)."""
-MIN_LAG_MS = 3.0
-"""Lag, ms, that needs no remedy: a turn of 150 degrees a second moves the view by half a degree
-meanwhile. Unfitted."""
-LAG_SIGMAS = 2.0
-"""Standard deviations by which a lag must exceed that. Unfitted."""
 
 # -- frames that a camera hands out again ------------------------------------------------
 
@@ -123,10 +97,6 @@ of EuRoC states, for cheaper sensors that warm up. Unfitted."""
 MIN_OF_IMAGES = 0.5
 """Fraction of the information on a rotation that must come from the images for it to show the
 bias: the rest is the gyroscope's own. Unfitted."""
-STANDARD_GRAVITY = 9.80665
-"""What an accelerometer at rest reads, m/s^2; over the earth it differs by .3 per cent."""
-UNKNOWN_FORCE_STD = 1e3
-"""Standard deviation of that along each axis before the first sample, m/s^2: unknown."""
 ACCELERATION_STD = 0.5
 """Standard deviation of a hand-held camera's acceleration along each axis, m/s^2, before samples
 show it. Unfitted."""
@@ -174,12 +144,6 @@ GREY_STD_OF_GRADIENT = 0.15
 OTHER_STD_OF_GRADIENT = 1.5
 """Spread of the grey levels of what is not static, as a multiple of the gradient, px; the contrast
 around adds to it. Unfitted."""
-AVERAGED_SIDE = 3
-"""Side of the square, in points of the grid, over which what each shows is averaged: its likelihood
-ratios, its prices and its neighbours. Unfitted."""
-LIGHT_CHANGE_SIDE = 9
-CONTRAST_SIDE = 5
-"""The same for a change of light, and for the contrast around a point. Unfitted."""
 MAX_CERTAINTY = 7.0
 """Largest log odds of a whole belief to be right. Unfitted."""
 CERTAINTY_BY_IMAGES = 3.0
@@ -276,6 +240,3 @@ SAME_DEPTH = 1.25
 OBJECT_CHANGE_STD = (0.02, 0.02)
 """Standard deviation of how the motion of an object changes from one frame to the next, m and rad.
 Unfitted."""
-MOST = 0.5
-"""Fraction above which a point is as those around it, a part belongs to an object, and a pixel to a
-mask: more than half."""

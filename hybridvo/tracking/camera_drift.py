@@ -32,14 +32,21 @@ from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.correlated_errors import robust_std
 from hybridvo.solver.images import choose_pixels
 from hybridvo.tracking.calibration import (
-    BEND_CUTOFF,
-    CAMERA_SIGMAS,
-    MAX_EVEN_MS,
     MAX_FOCAL_ERROR,
-    MIN_CAMERA_STEPS,
     MIN_FOCAL_INFORMATION,
     MIN_TURN_PX,
 )
+
+# Motions before which nothing is stated of the focal length or of the readout.
+MIN_CAMERA_STEPS = 30
+# Standard deviations by which a readout must differ from 0 before it is used, and a focal length
+# from what is allowed before it is off.
+CAMERA_SIGMAS = 3.0
+# Time between two frames, ms, up to which a hand turns a camera evenly.
+MAX_EVEN_MS = 100.0
+# Standard deviations from which a pair counts less in the mean of what pairs show of lag or
+# readout.
+BEND_CUTOFF = 2.0
 
 # cells of the image, of which each gives one pixel or none; with fewer there is no answer
 PIXELS = 1000

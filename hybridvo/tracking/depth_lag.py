@@ -24,14 +24,13 @@ from hybridvo.core.types import Frame, FramePair
 from hybridvo.judge.consistency import by_images_alone
 from hybridvo.solver.depth_alone import motion_by_depth
 from hybridvo.solver.newton import positive_inverse
-from hybridvo.tracking.calibration import (
-    MAX_EVEN_MS,
-    MIN_LAG_PAIRS,
-    MIN_TURN_GROWTH,
-)
-from hybridvo.tracking.camera_drift import Bend, robust_mean
+from hybridvo.tracking.calibration import MIN_TURN_GROWTH
+from hybridvo.tracking.camera_drift import MAX_EVEN_MS, Bend, robust_mean
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.repeated import repeat_of
+
+# Pairs before which nothing is stated of the lag.
+MIN_LAG_PAIRS = 20
 
 
 class Lag(NamedTuple):

@@ -25,14 +25,8 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Frame
-from hybridvo.solver.calibration import (
-    FOLLOWING_WEIGHT,
-    MIN_COMPARED_DEPTHS,
-)
-from hybridvo.tracking.calibration import (
-    DEPTH_SCALE_DRIFT,
-    DEPTH_SCALE_STD,
-)
+from hybridvo.solver.calibration import FOLLOWING_WEIGHT, MIN_COMPARED_DEPTHS
+from hybridvo.tracking.calibration import DEPTH_SCALE_DRIFT, DEPTH_SCALE_STD
 
 COMPARED = 8000
 """About how many pixels are compared."""

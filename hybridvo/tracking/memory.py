@@ -28,24 +28,28 @@ from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.points import Points, points_of
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
-    AVERAGED_SIDE,
     BELIEF_DECAY,
     BELIEF_LIMIT,
     BELIEF_SURE,
     CERTAINTY_BY_IMAGES,
-    CONTRAST_SIDE,
     DEPTH_RATIO,
     GREY_RATIO,
     GREY_STD,
     GREY_STD_OF_GRADIENT,
     HANDED_OVER,
-    LIGHT_CHANGE_SIDE,
     MAX_CERTAINTY,
     OTHER_STD_OF_GRADIENT,
     SEEN_THROUGH_LOG_ODDS,
 )
 from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import Keyframe
+
+# Side of the square, in points of the grid, over which what each shows is averaged: its
+# likelihood ratios, its prices and its neighbours.
+AVERAGED_SIDE = 3
+# Sides, in points of the grid, for a change of light, and for the contrast around a point.
+LIGHT_CHANGE_SIDE = 9
+CONTRAST_SIDE = 5
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,12 +8,12 @@ import numpy as np
 
 from hybridvo.core.geometry import invert, pose_matrix, se3_log
 from hybridvo.core.results import MotionPrior, identity_covariance
-from hybridvo.tracking.calibration import (
-    CHANGE_DECAY,
-    CHANGE_INFLATION,
-    MIN_CHANGE_STD,
-    MIN_CHANGES,
-)
+from hybridvo.tracking.calibration import CHANGE_DECAY, CHANGE_INFLATION
+
+# Changes of the motion; with fewer their standard deviation is not known yet.
+MIN_CHANGES = 3
+# Smallest standard deviation of a change, m and rad: no camera repeats its motion exactly.
+MIN_CHANGE_STD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,6 @@ from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
-    AVERAGED_SIDE,
     BEND,
     BY_DEPTH,
     CONTACT,
@@ -58,7 +57,6 @@ from hybridvo.tracking.calibration import (
     LEAST_OF_SEARCHED,
     MIN_MOVING_COST,
     MIN_OBJECT,
-    MOST,
     NEW_PRICE,
     OBJECT_FLOW_INFLATION,
     PARTS_OF_ONE,
@@ -71,7 +69,11 @@ from hybridvo.tracking.calibration import (
     STANDING_BONUS,
     SUSPECTED,
 )
-from hybridvo.tracking.memory import likelihood_ratios
+from hybridvo.tracking.memory import AVERAGED_SIDE, likelihood_ratios
+
+# Fraction above which a point is as those around it, a part belongs to an object, and a pixel to
+# a mask: more than half.
+MOST = 0.5
 
 # px around what is looked at: flow needs the surroundings
 MARGIN_PX = 24

@@ -37,7 +37,6 @@ from hybridvo.tracking.calibration import (
     MAX_OBJECT_LOG_ODDS,
     MIN_OBJECT_LOG_ODDS,
     MIN_OVERLAP,
-    MOST,
     NEW_OBJECT_FRAMES,
     NO_GAIN,
     OBJECT_CHANGE_STD,
@@ -45,6 +44,7 @@ from hybridvo.tracking.calibration import (
     TRACE_GAIN,
 )
 from hybridvo.tracking.object_motions import (
+    MOST,
     Expected,
     Fit,
     Region,

@@ -23,14 +23,16 @@ from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Step
 from hybridvo.core.types import Camera, Frame
 from hybridvo.evidence.one_time import at_image_time
-from hybridvo.tracking.calibration import (
+from hybridvo.tracking.calibration import MAX_READOUT_STD_MS, MIN_STATIC_SHARE
+from hybridvo.tracking.camera_drift import (
     CAMERA_SIGMAS,
     MAX_EVEN_MS,
-    MAX_READOUT_STD_MS,
     MIN_CAMERA_STEPS,
-    MIN_STATIC_SHARE,
+    Bend,
+    Mean,
+    bends_of,
+    robust_mean,
 )
-from hybridvo.tracking.camera_drift import Bend, Mean, bends_of, robust_mean
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.repeated import repeat_of
 

@@ -15,13 +15,11 @@ import numpy as np
 from hybridvo.core.geometry import invert, mean_flow
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Frame
-from hybridvo.tracking.calibration import (
-    ALIKE_PLACES,
-    MIN_LIKENESS,
-    PLACE_DISTANCE,
-    PLACES,
-)
+from hybridvo.tracking.calibration import ALIKE_PLACES, MIN_LIKENESS, PLACE_DISTANCE
 from hybridvo.tracking.keyframes import Keyframe
+
+# Earlier frames that are kept to find a lost path again.
+PLACES = 10
 
 # columns of the small images that are compared
 WIDTH = 40

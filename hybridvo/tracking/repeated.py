@@ -35,10 +35,7 @@ from hybridvo.judge.consistency import contradiction_by_depth
 from hybridvo.judge.findings import Finding, covering
 from hybridvo.judge.verdict import with_finding
 from hybridvo.solver.depth_alone import motion_by_depth
-from hybridvo.tracking.calibration import (
-    EQUAL_DEPTH,
-    STANDING_FLOW_PX,
-)
+from hybridvo.tracking.calibration import EQUAL_DEPTH, STANDING_FLOW_PX
 from hybridvo.tracking.tracker_state import TrackerState
 
 # every so many rows and columns of a depth map are compared

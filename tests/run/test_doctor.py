@@ -23,7 +23,7 @@ from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
 from hybridvo.run.commands.diagnosis.registration import registration
 from hybridvo.run.commands.doctor import diagnose, installation
 from hybridvo.run.commands.text import text_of
-from hybridvo.tracking.calibration import MIN_CAMERA_STEPS
+from hybridvo.tracking.camera_drift import MIN_CAMERA_STEPS
 
 
 def test_doctor_compiles_the_kernels_of_a_run_and_of_the_demo(monkeypatch):

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from hybridvo.core.options import RefineOptions
-from hybridvo.solver.calibration import GREY_NOISE_FLOOR
 from hybridvo.solver.image_factor import ImageFactor
+from hybridvo.solver.image_kernels import GREY_NOISE_FLOOR
 from hybridvo.solver.plane_kernels import fit_noise, non_negative
 from hybridvo.solver.visibility import depths_around
 from tests import worlds

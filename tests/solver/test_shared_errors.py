@@ -7,7 +7,7 @@ import pytest
 
 from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.solver import kernels
-from hybridvo.solver.calibration import FLOW_NOISE_FLOOR_PX
+from hybridvo.solver.noise_estimation import FLOW_NOISE_FLOOR_PX
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.shared_errors import (
     coherent_fraction,

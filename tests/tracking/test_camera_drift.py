@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 import hybridvo as hvo
 from hybridvo.core.geometry import backproject
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.tracking.calibration import MIN_CAMERA_STEPS
 from hybridvo.tracking.camera_drift import (
+    MIN_CAMERA_STEPS,
     Bend,
     FocalDrift,
     bends_of,

@@ -14,9 +14,8 @@ from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import dis_flow
 from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.tracking import tracker
-from hybridvo.tracking.calibration import PLACES
 from hybridvo.tracking.keyframes import Keyframe
-from hybridvo.tracking.relocalization import similar_places, with_place
+from hybridvo.tracking.relocalization import PLACES, similar_places, with_place
 
 SIZE = (120, 160)
 

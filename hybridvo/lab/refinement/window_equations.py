@@ -22,9 +22,13 @@ import torch
 
 from hybridvo.core.torch_geometry import pp
 from hybridvo.lab.refinement.window_unknowns import Edges, Unknowns, camera_columns
-from hybridvo.solver.calibration import MAX_STEP_RATIO
 from hybridvo.solver.torch import factors
-from hybridvo.solver.torch.factors import Pixels, ResidualModel, Weighted
+from hybridvo.solver.torch.factors import (
+    MAX_STEP_RATIO,
+    Pixels,
+    ResidualModel,
+    Weighted,
+)
 
 POSE = 6
 # Relative to the diagonal, by how much the factor of a matrix errs.

@@ -42,15 +42,12 @@ from hybridvo.lab.refinement.window_unknowns import (
     camera_columns,
     moved_pixels,
 )
-from hybridvo.solver.calibration import (
-    BATCH_SCALE_RATIO,
-    BATCH_STEP_TOLERANCE_STD,
-    SCALE_PER_RESIDUAL,
-)
+from hybridvo.solver.robust_fit import SCALE_PER_RESIDUAL
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.factors import Pixels, ResidualModel
 from hybridvo.solver.torch.newton import Rest, Rested, newton
+from hybridvo.solver.torch.solve import BATCH_SCALE_RATIO, BATCH_STEP_TOLERANCE_STD
 
 # Smallest second derivative of the cost by the depth of a pixel, of which its prior alone has 1:
 # numerical guard, a robust cost may bend the other way beside its minimum.

@@ -60,8 +60,8 @@ from hybridvo.run.commands.diagnosis.rolling_shutter import rolling_shutter
 from hybridvo.solver.calibration import DOUBTFUL_SPREAD
 from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
-from hybridvo.tracking.calibration import MAX_FOCAL_ERROR, MIN_CAMERA_STEPS
-from hybridvo.tracking.camera_drift import FocalDrift, bends_of
+from hybridvo.tracking.calibration import MAX_FOCAL_ERROR
+from hybridvo.tracking.camera_drift import MIN_CAMERA_STEPS, FocalDrift, bends_of
 from hybridvo.tracking.odometry import Odometry, warm_up
 
 COLUMNS = (

@@ -25,14 +25,16 @@ from hybridvo.core.torch_geometry import (
 )
 from hybridvo.core.types import PairBatch
 from hybridvo.solver import kernels
-from hybridvo.solver.calibration import (
-    BATCH_FIT_STEPS,
-    BEHIND_DISTANCE2,
-    MAX_STEP_RATIO,
-    SCALE_PER_RESIDUAL,
-)
+from hybridvo.solver.kernels import BEHIND_DISTANCE2
 from hybridvo.solver.pixels import typical
+from hybridvo.solver.robust_fit import SCALE_PER_RESIDUAL
 from hybridvo.solver.torch.newton import newton, small_inverse
+
+# Gauss-Newton steps of a fit to the pixels that a network is sure of.
+BATCH_FIT_STEPS = 6
+# A step of a batch is taken if delta^T H delta is at most so many times its predicted decrease: 1
+# / ``MIN_DECREASE``.
+MAX_STEP_RATIO = 4.0
 
 # Pixels that are worked on at once: on a CPU this takes half the time of all of them at once.
 PART = 131_072

@@ -17,34 +17,44 @@ from hybridvo.core.torch_geometry import left_update, pp, to_matrix
 from hybridvo.core.types import PairBatch
 from hybridvo.solver import kernels
 from hybridvo.solver.calibration import (
-    BATCH_NOISE_STEPS,
-    BATCH_SCALE_RATIO,
-    BATCH_STEP_TOLERANCE_STD,
-    BATCH_STEPS,
-    EXACT_PERIOD,
-    LARGEST_SCALE_PX,
     LARGEST_SEED_DISTANCE2,
     LARGEST_SOLUTION_DISTANCE2,
-    MAX_EXACT_STEP_RATIO,
-    MAX_STEP_RATIO,
     RIVAL_SCALES,
     RIVAL_WEIGHT,
-    SCALE_PER_RESIDUAL,
     SEED_FRACTION,
     SEED_SCALE_PX,
     SEED_STDS,
-    SMALLEST_SCALE_PX,
 )
 from hybridvo.solver.noise_estimation import START_NOISE, Noise, pair_noise
 from hybridvo.solver.pixels import grid_stride
+from hybridvo.solver.robust_fit import (
+    LARGEST_SCALE_PX,
+    SCALE_PER_RESIDUAL,
+    SMALLEST_SCALE_PX,
+)
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.factors import (
+    MAX_STEP_RATIO,
     NormalEquations,
     Pixels,
     ResidualModel,
     exact_depth_model,
 )
 from hybridvo.solver.torch.newton import Rest, Rested, newton, small_inverse
+
+# Factor from one scale to the next in the fit of a batch, which makes one step at each scale.
+BATCH_SCALE_RATIO = 0.7
+# Most Newton steps on all pixels of a batch.
+BATCH_STEPS = 20
+# Gauss-Newton steps after each estimate of the noise of a batch.
+BATCH_NOISE_STEPS = (2, 3, 3, 0)
+# Length of the last step of a batch, standard deviations.
+BATCH_STEP_TOLERANCE_STD = 4.0
+# The same near a solution that the gradient needs exactly: there the full derivative may be much
+# flatter than H, and is right. See MAX_STEP_RATIO.
+MAX_EXACT_STEP_RATIO = 100.0
+# Steps of a batch between two exact derivatives.
+EXACT_PERIOD = 3
 
 # Pixels of each sample on which starts are refined.
 SUBSET_PIXELS = 2048

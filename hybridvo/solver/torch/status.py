@@ -17,17 +17,14 @@ from hybridvo.core.results import (
 from hybridvo.core.torch_geometry import pp, to_matrix
 from hybridvo.core.types import PairBatch
 from hybridvo.flow.calibration import DIS_NOISE
-from hybridvo.solver.calibration import (
-    AGREEMENT_RIGHT,
-    BATCH_STEPS,
-)
+from hybridvo.solver.calibration import AGREEMENT_RIGHT
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.pixels import too_few
 from hybridvo.solver.status import FitSummary, degeneracy, status_of
 from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.covariance import BatchCovariance
 from hybridvo.solver.torch.factors import Pixels
-from hybridvo.solver.torch.solve import BatchFit
+from hybridvo.solver.torch.solve import BATCH_STEPS, BatchFit
 
 
 class StartEvidence(NamedTuple):

@@ -6,12 +6,16 @@ from typing import Any
 
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.clocks import middle_frames
-from hybridvo.tracking.calibration import (
-    LAG_SIGMAS,
-    MAX_LAG_STD_MS,
-    MIN_LAG_MS,
-)
 from hybridvo.tracking.depth_lag import find_lag
+
+# Standard deviation of the lag, ms, from which on it is not known: a D435 turned to and fro for
+# three seconds shows it to 2 or 4 (``hybridvo doctor DIR``).
+MAX_LAG_STD_MS = 4.0
+# Lag, ms, that needs no remedy: a turn of 150 degrees a second moves the view by half a degree
+# meanwhile.
+MIN_LAG_MS = 3.0
+# Standard deviations by which a lag must exceed that.
+LAG_SIGMAS = 2.0
 
 REMEDY = (
     "turn the camera to and fro before things of some structure, at 15 Hz or more"

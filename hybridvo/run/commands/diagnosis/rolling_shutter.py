@@ -8,7 +8,7 @@ from typing import Any
 from hybridvo.core.types import Frame
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.clocks import middle_frames
-from hybridvo.tracking.calibration import CAMERA_SIGMAS
+from hybridvo.tracking.camera_drift import CAMERA_SIGMAS
 from hybridvo.tracking.passes import find_times
 
 REMEDY = "turn the camera to and fro, also in the plane of the image, or pass more --pairs"
