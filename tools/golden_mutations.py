@@ -28,7 +28,7 @@ COVARIANCE_FACTOR = 4.0
 UP = 4.0 / 3.0
 DOWN = 2.0 / 3.0
 ROOMS = (
-    *("core", "flow", "solver", "judge", "hypotheses", "evidence", "network"),
+    *("core", "flow", "solver", "judge", "hypotheses", "evidence"),
     *("baselines", "tracking", "io", "lab", "run"),
 )
 """Rooms with numbers that decide."""
@@ -100,7 +100,6 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "TRUTH_NOISE[folder][1]": (DOWN, "ladder_evaluation/folder_at_0.2m"),
     "TRUTH_NOISE[kitti][0]": (DOWN, "ladder_evaluation/kitti_at_20m"),
     "TRUTH_NOISE[kitti][1]": (DOWN, "ladder_evaluation/kitti_at_0.2m"),
-    "MAX_COORDINATE_M": (DOWN, "ladder_evaluation/far"),
     # the doctor
     "MIN_VALID_DEPTH": (DOWN, "ladder_doctor/little_depth"),
     "EMPTY_DEPTH": (DOWN, "ladder_doctor/empty_frames"),

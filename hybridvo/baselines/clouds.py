@@ -12,19 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hybridvo.baselines.calibration import (
-    CLOUD_MATCH_VOXELS,
-    CLOUD_MIN_POINTS,
-    CLOUD_RANGE_RATIO,
-    CLOUD_VOXEL_RATIO,
-    KISS_THRESHOLD_VOXELS,
-    KISS_VOXEL_RATIO,
+from hybridvo.baselines.correspondences import (
     MIN_CONSENSUS_RATIO,
     OPENCV_INLIER_PX,
     SELF_FLOW_STD_PX,
     SINGULAR_RATIO,
-)
-from hybridvo.baselines.correspondences import (
     depth_in_range,
     self_consistent,
     with_covariance,
@@ -33,6 +25,20 @@ from hybridvo.baselines.solvers import SOLVER_ERRORS
 from hybridvo.core.geometry import adjoint, backproject, invert, pose_matrix
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import Frame, FramePair
+
+# median depths, of the farthest point: the noise of depth cameras grows with the
+# square of depth, and the sky of renderers is no surface
+CLOUD_RANGE_RATIO = 2.0
+# median depths, of the side of small_gicp's voxels
+CLOUD_VOXEL_RATIO = 0.015
+# voxels between two points that belong together in small_gicp
+CLOUD_MATCH_VOXELS = 5.0
+# points that a registration needs: each looks at ten neighbours
+CLOUD_MIN_POINTS = 50
+# ranges, of the side of KISS-ICP's voxels: its own rule
+KISS_VOXEL_RATIO = 0.01
+# voxels, of its first threshold: its default of 2 m at voxels of 1 m
+KISS_THRESHOLD_VOXELS = 2.0
 
 PIXEL_STEP = 2
 """Every second row and column becomes a point."""

@@ -8,10 +8,7 @@ import numpy as np
 
 from hybridvo.baselines.calibration import (
     INLIER_STDS,
-    MIN_CONSENSUS_RATIO,
     MIN_INLIER_PX,
-    MIN_SOLVER_POINTS,
-    SINGULAR_RATIO,
 )
 from hybridvo.core.checks import as_rigid
 from hybridvo.core.errors import InputError
@@ -24,6 +21,18 @@ from hybridvo.core.geometry import (
 from hybridvo.core.results import Reason, RelativePose, StageFailed
 from hybridvo.core.types import Camera, FramePair
 from hybridvo.flow.calibration import UNSTATED_FLOW_STD_PX
+
+# px: OpenCV's own limit on the residual of an inlier
+OPENCV_INLIER_PX = 8.0
+# fraction of the sampled pixels that must be inliers: below, a consensus is chance
+MIN_CONSENSUS_RATIO = 0.05
+# correspondences, and inliers, that a solver needs: four always fit some pose
+MIN_SOLVER_POINTS = 6
+# of the information's extreme eigenvalues, below which a covariance cannot be
+# stated: a patch of 20 px has 1e-9
+SINGULAR_RATIO = 1e-10
+# px, of the flow of a motion without any given flow
+SELF_FLOW_STD_PX = 1.0
 
 # random valid pixels for a solver; all of them cost 50 times more for no accuracy
 POINTS = 10_000

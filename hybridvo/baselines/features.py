@@ -7,20 +7,15 @@ import contextlib
 import cv2
 import numpy as np
 
-from hybridvo.baselines.calibration import (
-    MIN_SOLVER_POINTS,
-    SIFT_FEATURES,
-    SIFT_INLIER_PX,
-    SIFT_RATIO,
-    SOLVER_CONFIDENCE,
-)
 from hybridvo.baselines.correspondences import (
+    MIN_SOLVER_POINTS,
     Correspondences,
     depth_in_range,
     with_covariance,
 )
 from hybridvo.baselines.solvers import (
     MAX_ITERATIONS,
+    SOLVER_CONFIDENCE,
     SOLVER_ERRORS,
     pnp_ransac,
     transform_of,
@@ -28,6 +23,13 @@ from hybridvo.baselines.solvers import (
 from hybridvo.core.geometry import backproject
 from hybridvo.core.results import Reason, RelativePose, StageFailed
 from hybridvo.core.types import Frame, FramePair
+
+# features of an image that are kept, the strongest first
+SIFT_FEATURES = 2000
+# of the distances to the nearest and the next descriptor: Lowe's (IJCV 2004)
+SIFT_RATIO = 0.8
+# px, of the residual of an inlier: SIFT places features to about half a pixel
+SIFT_INLIER_PX = 2.0
 
 
 def estimate_by_features(pair: FramePair, seed: int) -> RelativePose:

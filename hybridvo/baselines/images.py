@@ -13,11 +13,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.baselines.calibration import (
+from hybridvo.baselines.correspondences import (
     OPENCV_INLIER_PX,
     SELF_FLOW_STD_PX,
-)
-from hybridvo.baselines.correspondences import (
     depth_in_range,
     sample,
     self_consistent,

@@ -14,12 +14,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.baselines.calibration import (
+from hybridvo.baselines.correspondences import (
     MIN_SOLVER_POINTS,
     OPENCV_INLIER_PX,
-    SOLVER_CONFIDENCE,
-)
-from hybridvo.baselines.correspondences import (
     Correspondences,
     sample,
     with_covariance,
@@ -27,6 +24,9 @@ from hybridvo.baselines.correspondences import (
 from hybridvo.core.geometry import make_transform
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Camera, FramePair
+
+# probability that one sample of the tuned solvers is free of outliers
+SOLVER_CONFIDENCE = 0.999
 
 # samples of the tuned solvers; the defaults are 100 of OpenCV, 100 000 of PoseLib
 MAX_ITERATIONS = 1000

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.core.calibration import (
-    EVERYDAY_DEPTH_M,
-    MIN_NEARER_THAN_SKY,
-    PLAUSIBLE_DEPTH_M,
-    SKY_DEPTH_M,
-)
+# m: where the median of a map, without the sky, lies outside, its unit is another
+PLAUSIBLE_DEPTH_M = (0.1, 200.0)
+# m: where the median of an indoor map usually lies; of several units the one that
+# leads there is named
+EVERYDAY_DEPTH_M = (0.3, 8.0)
+# m: renderers state such depths for the sky, no sensor reaches them
+SKY_DEPTH_M = 1000.0
+# of nearer pixels to those beyond: with fewer the depths are not in metres
+MIN_NEARER_THAN_SKY = 0.1
+
 
 UNITS_PER_METRE = {
     1000: "millimetres",

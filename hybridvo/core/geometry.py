@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from hybridvo.core.calibration import MAX_BEHIND_CAMERA
 from hybridvo.core.errors import InputError
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Camera, Frame
+
+# fraction of the points that may end behind the camera before the mean length of
+# their flow counts as infinite
+MAX_BEHIND_CAMERA = 0.1
 
 # pixels of a frame, about, over which the mean length of its ego flow is taken
 MEAN_FLOW_PIXELS = 300
@@ -226,7 +229,7 @@ def mean_flow(frame: Frame, T_curr_prev: np.ndarray) -> float:
 
     Returns:
         A fraction of the image's width; infinite where the frame has no depth, or
-        where more than :data:`hybridvo.calibration.MAX_BEHIND_CAMERA` of the points
+        where more than :data:`MAX_BEHIND_CAMERA` of the points
         end behind the camera.
     """
     pixels, points = _regular_points(frame)

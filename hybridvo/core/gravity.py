@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.core.calibration import MIN_HORIZONTAL
 from hybridvo.core.geometry import make_transform
+
+# of the first camera's optical axis, as a fraction: below the sine of 15 degrees an
+# error of the vertical turns the heading four times as far
+MIN_HORIZONTAL = 0.26
 
 
 @dataclass(frozen=True, eq=False)

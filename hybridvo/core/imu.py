@@ -6,10 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hybridvo.core.calibration import IMU_KEPT_S, MAX_LATE_SAMPLE_S
 from hybridvo.core.checks import as_number, as_rigid, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import make_transform
+
+# s between what stamps say and what they should, from which the clock has jumped:
+# USB holds frames up by some tenths of a second, a bag may be played again
+MAX_CLOCK_JUMP_S = 1.0
+# s over which samples are kept that no frame has taken: after a minute without a
+# usable frame the path is lost anyway
+IMU_KEPT_S = 60.0
 
 ROTATION_TOLERANCE = 1e-3
 """By which the axes of a sensor may differ from a rotation, entry by entry."""
@@ -150,7 +156,7 @@ def with_earlier(
         return later
     if later is None or not len(later):
         return earlier
-    if later.stamps[0] < earlier.stamps[-1] - MAX_LATE_SAMPLE_S:
+    if later.stamps[0] < earlier.stamps[-1] - MAX_CLOCK_JUMP_S:
         return later
     joined = earlier.joined(later)
     return joined.between(joined.stamps[-1] - IMU_KEPT_S, np.inf)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from hybridvo.core.calibration import IDENTITY_STD
 from hybridvo.core.checks import as_rigid, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import invert, rotation_angle
@@ -18,6 +17,10 @@ from hybridvo.core.gravity import Gravity
 
 if TYPE_CHECKING:
     import torch
+
+# m and rad, of a step of a hand-held camera of which nothing is known: at most so
+# large
+IDENTITY_STD = (1.0, 0.3)
 
 UNINFORMATIVE_COVARIANCE = np.diag([1e4, 1e4, 1e4, 10.0, 10.0, 10.0])
 """Covariance that carries no information, m^2 and rad^2."""

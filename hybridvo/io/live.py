@@ -20,27 +20,11 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.gravity import Gravity
-from hybridvo.core.imu import ImuSamples, with_earlier
+from hybridvo.core.imu import MAX_CLOCK_JUMP_S, ImuSamples, with_earlier
 from hybridvo.core.options import Options
 from hybridvo.core.results import Step
 from hybridvo.core.stages import stage_summary, stage_times
 from hybridvo.core.types import Frame
-from hybridvo.io.calibration import (
-    FIRST_RETRY_S,
-    LIVE_WAIT_S,
-    MAX_ABSENCE_S,
-    MAX_CLOCK_JUMP_S,
-    MAX_CLOSING_S,
-    MAX_DROPPED,
-    MAX_FRAME_AGE_S,
-    MAX_OLD_FRAMES,
-    MAX_RETRY_S,
-    MAX_SILENCE_S,
-    MAX_STANDING_STAMPS,
-    MIN_POSES_HZ,
-    RATE_STEPS,
-    STAGE_STEPS,
-)
 from hybridvo.io.cameras.base import (
     CameraLost,
     EndOfFrames,
@@ -49,12 +33,41 @@ from hybridvo.io.cameras.base import (
     rate_of,
 )
 from hybridvo.io.data.resize import resize_frame
-from hybridvo.io.live_rate import AutoRate, RateKeeper
+from hybridvo.io.live_rate import MIN_POSES_HZ, AutoRate, RateKeeper
 from hybridvo.io.viewer.scene import Seen
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.tracking.keyframes import has_enough_depth
 from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.tracker_state import TrackerState
+
+# s, from which a frame is dropped: sensors hand one out after 0.02 to 0.1 s, above
+# half a second something has held it up
+MAX_FRAME_AGE_S = 0.5
+# frames in a row that are dropped for their age; then the camera itself is slow, or
+# its clock is wrong
+MAX_OLD_FRAMES = 10
+# frames in a row whose stamps do not rise, from which on the camera has no clock:
+# drivers hand a frame out two or three times
+MAX_STANDING_STAMPS = 5
+# s, until a request to stop is looked for: for a person, at once
+LIVE_WAIT_S = 0.1
+# s without a frame after which a camera is opened again: RealSense and OAK need up
+# to two seconds for their first frame
+MAX_SILENCE_S = 3.0
+# s until a lost camera is opened again; doubled with every attempt that fails
+FIRST_RETRY_S = 1.0
+# s between two such attempts: a plug that is put back in is noticed soon enough
+MAX_RETRY_S = 8.0
+# s without a frame after which a run ends: long enough to plug a camera in again
+MAX_ABSENCE_S = 60.0
+# s that a camera has to stop; one that hangs is left alone
+MAX_CLOSING_S = 5.0
+# steps over which the figures on the screen are counted: one second
+RATE_STEPS = 30
+# steps over which the times of the stages are stated: half a minute
+STAGE_STEPS = 1000
+# share of dropped frames up to which nothing needs to be done about them
+MAX_DROPPED = 0.05
 
 _logger = logging.getLogger(__name__)
 

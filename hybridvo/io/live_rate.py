@@ -17,16 +17,21 @@ import numpy as np
 from hybridvo.core.options import Options
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.calibration import (
-    GUARDED_STEPS,
-    LIVE_RATE_HZ,
     MIN_LIVE_COLUMNS,
-    MIN_POSES_HZ,
-    RATE_FRAMES,
     SMALL_FLOW,
 )
+from hybridvo.io.cameras.settings import LIVE_RATE_HZ
 from hybridvo.io.data.resize import resize_frame
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.tracking.odometry import Odometry
+
+# poses a second that are kept where the camera's rate cannot be: a hand moves by a
+# few centimetres meanwhile, which the search still finds
+MIN_POSES_HZ = 10.0
+# first frames of a camera by which a level is chosen: a sixth of a second
+RATE_FRAMES = 5
+# steps in a row whose mean time decides whether a level is too slow
+GUARDED_STEPS = 15
 
 DIVISORS = (1, 2, 3)
 """By which the size of the images is divided, the most accurate first."""

@@ -24,11 +24,10 @@ from hybridvo.hypotheses.select import (
     surest,
 )
 from hybridvo.judge.choice import choice_probability
-from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
-from hybridvo.network.selection import seed_weights
+from hybridvo.network.selection import INVALID_LOG_SCALE, seed_weights
 from hybridvo.solver.noise_estimation import START_NOISE
 from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.torch.tools import has_torch_geometry, uncompiled

@@ -19,18 +19,21 @@ from hybridvo.core.results import (
     Status,
 )
 from hybridvo.core.types import FramePair
-from hybridvo.network.calibration import (
-    MAX_NETWORK_SCALE_DEG,
-    MIN_NETWORK_PIXELS,
-    UNSTATED_ROTATION_DEG,
-    UNSTATED_TRANSLATION_M,
-)
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.pair_maps import predict_pairs
 from hybridvo.network.selection import select_pose
 from hybridvo.network.threads import single_threaded_inference
 from hybridvo.solver.pixels import too_few
+
+# pixels of the input with flow and depth that a network needs
+MIN_NETWORK_PIXELS = 64
+# degrees of uncertainty above which an answer is degraded: more than most cameras
+# turn between two frames
+MAX_NETWORK_SCALE_DEG = 2.0
+# uncertainty of a network that states none: a usual motion
+UNSTATED_ROTATION_DEG = 1.0
+UNSTATED_TRANSLATION_M = 0.3
 
 # numerical guard, degrees and metres: half precision resolves no smaller uncertainty
 MIN_SCALE = 1e-4

@@ -11,7 +11,6 @@ from hybridvo.core.euler import euler_transform
 from hybridvo.core.results import MotionPrior, PixelwisePrediction
 from hybridvo.hypotheses.select import Candidate, RefitStart, Scores
 from hybridvo.hypotheses.types import HypothesisSet
-from hybridvo.network.calibration import MAX_SCORE_DEFICIT
 from hybridvo.network.grid_maps import grid_maps
 from hybridvo.network.hypothesis_inputs import hypothesis_inputs
 from hybridvo.network.hypothesis_maps import (
@@ -21,6 +20,10 @@ from hybridvo.network.hypothesis_maps import (
     Looks,
 )
 from hybridvo.network.selection import select_pose
+
+# nats from the best score at which a candidate is fitted again: it is then a
+# twentieth as probable
+MAX_SCORE_DEFICIT = 3.0
 
 
 class PWVOScorer:

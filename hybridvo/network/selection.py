@@ -30,10 +30,6 @@ from hybridvo.core.errors import InputError
 from hybridvo.core.euler import euler_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import check_dense
-from hybridvo.network.calibration import (
-    MIN_SEED_WEIGHT,
-    SEED_SHARPNESS,
-)
 from hybridvo.solver.torch.tools import (
     SeedMarks,
     covariance_of,
@@ -41,6 +37,12 @@ from hybridvo.solver.torch.tools import (
     to_tiles,
     with_marks,
 )
+
+# over the largest weight: pixels of large uncertainty decide only where there are
+# no others
+MIN_SEED_WEIGHT = 1e-2
+# of a pixel without flow or depth, at least: 20 degrees or 20 m
+INVALID_LOG_SCALE = 3.0
 
 SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
 PATCH_METHODS = ("fused", "surest", "patch_mean")
@@ -161,7 +163,7 @@ def seed_weights(maps: PixelwisePrediction) -> torch.Tensor:
     image_size = maps.image_size
     s = rotation_log_scale(maps.log_scale)
     smallest = s.flatten(1).amin(dim=1)[:, None, None]
-    weights = torch.exp(-SEED_SHARPNESS * (s - smallest))
+    weights = torch.exp(smallest - s)
     weights = weights.clamp(min=MIN_SEED_WEIGHT)
     if image_size is None:
         return weights

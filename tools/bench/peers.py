@@ -35,8 +35,12 @@ from hybridvo import (
     open_sequence,
 )
 from hybridvo.baselines import ALIGNERS, WITHOUT_FLOW
-from hybridvo.baselines.calibration import CLOUD_RANGE_RATIO
-from hybridvo.baselines.clouds import kiss_odometry, median_depth, points_of
+from hybridvo.baselines.clouds import (
+    CLOUD_RANGE_RATIO,
+    kiss_odometry,
+    median_depth,
+    points_of,
+)
 from hybridvo.core.errors import DegenerateError
 from hybridvo.core.geometry import invert, rotation_angle
 from hybridvo.flow.providers import FlowField

@@ -8,8 +8,16 @@ from collections.abc import Callable
 import numpy as np
 
 from hybridvo.core.imu import ImuSamples, rising
-from hybridvo.io.calibration import IMU_READINGS, MAX_ACCELERATION_LAG_S
 from hybridvo.io.cameras.base import Reading
+
+# readings a second that are requested, or the next rate above: what EuRoC's sensor
+# gives
+IMU_RATE_HZ = 200
+# readings that are held while no frame comes: ten seconds of the fastest
+IMU_READINGS = 4000
+# s by which accelerations may end before the rates, or begin after them: several
+# readings of the slowest sensor, 63 a second
+MAX_ACCELERATION_LAG_S = 0.1
 
 Readings = deque[tuple[float, float, float, float]]
 """Stamps, seconds, each with the three numbers that were read."""

@@ -10,11 +10,13 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera
-from hybridvo.io.calibration import IMU_MESSAGES, IMU_RATE_HZ
 from hybridvo.io.cameras.base import FrameMaker, Reading, load_sdk
-from hybridvo.io.cameras.inertial import CameraImu, ImuBuffer
+from hybridvo.io.cameras.inertial import IMU_RATE_HZ, CameraImu, ImuBuffer
 from hybridvo.io.cameras.settings import CameraSettings
 from hybridvo.io.data.streams import Lens
+
+# messages of the IMU that wait for a frame: half a second and more
+IMU_MESSAGES = 100
 
 SWITCHES = ("left_right_check", "subpixel", "extended_disparity")
 """Options of the stereo node, 0 or 1."""

@@ -10,9 +10,8 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera
-from hybridvo.io.calibration import IMU_RATE_HZ
 from hybridvo.io.cameras.base import CameraLost, FrameMaker, Reading, load_sdk
-from hybridvo.io.cameras.inertial import CameraImu, ImuBuffer
+from hybridvo.io.cameras.inertial import IMU_RATE_HZ, CameraImu, ImuBuffer
 from hybridvo.io.cameras.settings import CameraSettings
 from hybridvo.io.data.streams import Lens
 

@@ -9,11 +9,12 @@ from typing import Any, Literal
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import MAX_YAML_LENGTH, parse_yaml, read_text
 from hybridvo.core.options import Count, NonNegative, Positive, option_group
-from hybridvo.io.calibration import (
-    LIVE_HEIGHT_PX,
-    LIVE_RATE_HZ,
-    LIVE_WIDTH_PX,
-)
+
+# where no preset states otherwise: every camera that has a driver offers this, and
+# two cores keep up with it
+LIVE_WIDTH_PX = 640
+LIVE_HEIGHT_PX = 480
+LIVE_RATE_HZ = 30
 
 PRESET_FOLDERS = (
     Path(__file__).parent / "presets",

@@ -19,12 +19,7 @@ from hybridvo.core.files import read_text
 from hybridvo.core.geometry import invert, ned_to_camera, pose_matrix
 from hybridvo.core.trajectory import COLUMNS, read_poses
 from hybridvo.core.types import Camera, Frame
-from hybridvo.io.calibration import (
-    DISPARITY_STD_PX,
-    LONGEST_DURATION_S,
-    MAX_DISPARITY_PX,
-    STEREO_BLOCK_PX,
-)
+from hybridvo.io.calibration import DISPARITY_STD_PX
 from hybridvo.io.data import image_io, lists
 from hybridvo.io.data.camera_file import (
     CALIBRATION_FILE,
@@ -32,6 +27,10 @@ from hybridvo.io.data.camera_file import (
     read_camera_file,
 )
 from hybridvo.io.data.sequence import Sequence
+from hybridvo.io.data.stereo import MAX_DISPARITY_PX, STEREO_BLOCK_PX
+
+# s: a recorder that leaves longer between two frames is no video
+LONGEST_DURATION_S = 1.0
 
 FLOW_PNG_CHANNELS = (0, 1, 2)
 """Channels of u, v and the mask, in OpenCV's order, in TartanAir's flow PNGs. KITTI's are

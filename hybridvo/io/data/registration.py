@@ -11,7 +11,10 @@ from hybridvo.compiled.numba_tools import as_contiguous, njit
 from hybridvo.core.checks import as_rigid, to_numpy
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera
-from hybridvo.io.calibration import MAX_FOOTPRINT_PX
+
+# pixels of colour, along a row or a column, that one pixel of depth may cover:
+# sensors have 1 to 8, a damaged map would cover the whole image
+MAX_FOOTPRINT_PX = 32
 
 
 def register_depth(

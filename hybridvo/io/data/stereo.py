@@ -12,13 +12,15 @@ from hybridvo.core.checks import as_rigid
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
-from hybridvo.io.calibration import (
-    DISPARITY_STD_PX,
-    MAX_DISPARITY_PX,
-    STEREO_BLOCK_PX,
-)
+from hybridvo.io.calibration import DISPARITY_STD_PX
 from hybridvo.io.data.sequence import UndistortionMaps, undistort
 from hybridvo.io.data.streams import Images, Lens
+
+# px that are searched: at KITTI's focal length and baseline all beyond 3 m, at
+# EuRoC's beyond 0.4 m
+MAX_DISPARITY_PX = 128
+# px, of the side of the blocks of two images that are compared
+STEREO_BLOCK_PX = 5
 
 MIN_BASELINE_M = 1e-4
 """Two cameras that are closer are one."""

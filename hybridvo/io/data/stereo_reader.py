@@ -14,7 +14,6 @@ from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import MAX_YAML_LENGTH, parse_yaml, read_rows, read_text
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.types import Camera
-from hybridvo.io.calibration import MAX_STEREO_INTERVAL_S
 from hybridvo.io.data import lists
 from hybridvo.io.data.camera_file import CAMERA_FILE, parse_camera
 from hybridvo.io.data.image_io import image_size, read_rgb
@@ -33,6 +32,10 @@ from hybridvo.io.data.streams import (
     check_lens,
     stamps_of_files,
 )
+
+# s, between the two images of a pair: cameras that are triggered together state the
+# same stamp to a few tenths of a millisecond
+MAX_STEREO_INTERVAL_S = 0.005
 
 
 class StereoSequence(StreamSequence):

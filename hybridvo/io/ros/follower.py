@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.imu import ImuSamples, with_earlier
+from hybridvo.core.imu import MAX_CLOCK_JUMP_S, ImuSamples, with_earlier
 from hybridvo.core.options import Options
 from hybridvo.core.results import UNINFORMATIVE_COVARIANCE, Step
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import dis_flow
-from hybridvo.io.calibration import MAX_CLOCK_JUMP_S
 from hybridvo.io.masks import mask_of
 from hybridvo.io.ros.conversions import (
     Twist,

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.core.calibration import IMU_KEPT_S, MAX_LATE_SAMPLE_S
-from hybridvo.core.imu import ImuSamples
+from hybridvo.core.imu import IMU_KEPT_S, MAX_CLOCK_JUMP_S, ImuSamples
 from hybridvo.io.data.bags.messages import imu_row
 
 NS = 1e9
@@ -46,7 +45,7 @@ class Rates:
             return
         self.frame_id = str(message.header.frame_id).lstrip("/")
         if self.latest_ns is not None and row[0] <= self.latest_ns:
-            if self.latest_ns - row[0] < MAX_LATE_SAMPLE_S * NS:
+            if self.latest_ns - row[0] < MAX_CLOCK_JUMP_S * NS:
                 return
             # a bag that is played again
             self._rows.clear()

@@ -11,12 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hybridvo.core.imu import ImuSamples
-from hybridvo.io.calibration import IMU_PATIENCE_S
 from hybridvo.io.data.bags.messages import rigid, transform_between
 from hybridvo.io.ros.conversions import Mount, base_mount, optical_mount
 from hybridvo.io.ros.frames import stamp_ns
 from hybridvo.io.ros.gyroscope import Rates, has_rates
 from hybridvo.io.ros.parameters import NodeOptions
+
+# s that a frame waits for samples up to its stamp: a gyroscope of 100 Hz hands one
+# out every .01 s, and DDS delivers it in less
+IMU_PATIENCE_S = 0.05
 
 
 class Arrived(NamedTuple):

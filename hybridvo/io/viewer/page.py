@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 
-from hybridvo.io.calibration import VIEWER_POLL_S
+from hybridvo.io.viewer.program import VIEWER_POLL_S
 
 
 def main(words: Sequence[str]) -> int:

@@ -12,8 +12,12 @@ import time
 from typing import IO
 from urllib.parse import quote
 
-from hybridvo.io.calibration import VIEWER_POLL_S, VIEWER_START_S
 from hybridvo.io.viewer.address import HOST, PAGE_PORT, PORT, SERVE, Address
+
+# s within which the viewer has to listen: a window needs about one
+VIEWER_START_S = 20.0
+# s between two questions whether it listens
+VIEWER_POLL_S = 0.1
 
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 """Variables of which one is set where Linux can show a window."""

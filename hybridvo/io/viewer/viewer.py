@@ -17,11 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.io.calibration import VIEWER_CLOSING_S, VIEWER_SILENCE_S
 from hybridvo.io.viewer.address import CONNECT, Address, parse_address
 from hybridvo.io.viewer.layout import blueprint
 from hybridvo.io.viewer.program import REMEDY, NoViewer, Program, listens
 from hybridvo.io.viewer.scene import TRUTH, Scene, Seen
+
+# s after which a viewer that takes nothing is lost; the tracker does not wait
+VIEWER_SILENCE_S = 5.0
+# s at the end of a run for what the viewer has not taken yet: more than its silence
+# may last
+VIEWER_CLOSING_S = 10.0
 
 MAX_WAITING_IMAGES = 2
 """Steps that may wait with their images; those that come then are shown without."""

@@ -16,13 +16,15 @@ from hybridvo.core.errors import DegenerateError, InputError
 from hybridvo.core.geometry import invert, make_transform, rotation_angle
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
-from hybridvo.lab.calibration import (
-    MAX_COORDINATE_M,
-    MIN_MATCHED_RATIO,
-)
 
 if TYPE_CHECKING:
     from evo.core.trajectory import PoseTrajectory3D
+
+# m: a double resolves 0.1 mm there; beyond it errors of millimetres are rounding,
+# and squares of 1e160 overflow
+MAX_COORDINATE_M = 1e12
+# fraction of the poses that must match in time; below it clocks or units differ
+MIN_MATCHED_RATIO = 0.5
 
 Alignment = Literal["se3", "sim3", "origin", "none"]
 DeltaUnit = Literal["frames", "s"]

@@ -13,9 +13,9 @@ from hybridvo.core.errors import DegenerateError, InputError
 from hybridvo.core.geometry import invert, rotation_angle
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.data.open import open_sequence
-from hybridvo.lab.calibration import MIN_MATCHED_RATIO
 from hybridvo.lab.evaluation import scores
 from hybridvo.lab.evaluation.metrics import (
+    MIN_MATCHED_RATIO,
     Match,
     RelativeErrors,
     ate,

@@ -18,13 +18,17 @@ from hybridvo.io.data.image_io import UNKNOWN_FLOW
 from hybridvo.io.data.resize import resize_camera
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.lab.calibration import (
-    DEPTH_SPREAD_QUANTILES,
-    MOVING_PX,
-    RATE_CONFIDENCE,
     TRUTH_NOISE,
     WRONG_PX,
 )
 from hybridvo.lab.evaluation.belief import is_wrong, wrong_limits
+
+# probability that the stated interval of a rate covers it
+RATE_CONFIDENCE = 0.95
+# of a depth map, whose ratio is stated in reports
+DEPTH_SPREAD_QUANTILES = (0.1, 0.9)
+# px between true flow and true ego flow, above which a pixel moves by itself
+MOVING_PX = 1.0
 
 PAPER_SIZE = (128, 256)
 """Height and width, pixels, at which the paper measures its EPE."""

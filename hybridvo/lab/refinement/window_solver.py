@@ -20,11 +20,6 @@ from hybridvo.core.checks import brief
 from hybridvo.core.errors import InputError
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.core.torch_geometry import left_update, pp, to_matrix
-from hybridvo.lab.calibration import (
-    WINDOW_EDGE_STEPS,
-    WINDOW_STEP_TOLERANCE_STD,
-    WINDOW_STEPS,
-)
 from hybridvo.lab.refinement.window_equations import (
     POSE,
     EdgeSums,
@@ -48,6 +43,16 @@ from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.factors import Pixels, ResidualModel
 from hybridvo.solver.torch.newton import Rest, Rested, newton
 from hybridvo.solver.torch.solve import BATCH_SCALE_RATIO, BATCH_STEP_TOLERANCE_STD
+
+# Gauss-Newton steps: each at least halves the distance to the solution, and a
+# gradient needs it to the precision of the numbers
+WINDOW_STEPS = 40
+# standard deviations, of the last step of a window with more unknowns than poses:
+# what it leaves may be as long as it
+WINDOW_STEP_TOLERANCE_STD = 0.1
+# steps that bring each edge to the focal length and scales of its window, before
+# both are compared
+WINDOW_EDGE_STEPS = 5
 
 # Smallest second derivative of the cost by the depth of a pixel, of which its prior alone has 1:
 # numerical guard, a robust cost may bend the other way beside its minimum.

@@ -11,19 +11,24 @@ from hybridvo.core.geometry import ego_flow
 from hybridvo.core.results import PixelwisePrediction, RelativePose
 from hybridvo.core.types import FramePair
 from hybridvo.flow.colours import high_value, longest_flow
-from hybridvo.lab.calibration import (
-    MIN_REGION_AREA,
-    MIN_REGION_THICKNESS,
-    MOVING_BLUR_PX,
-    MOVING_FLOW_STDS,
-    MOVING_GREY_LEVELS,
-    MOVING_PX,
-    UNUSED_WEIGHT,
-)
+from hybridvo.lab.evaluation.scores import MOVING_PX
 from hybridvo.lab.visualization.panels import (
     Panel,
     flow_panel,
 )
+
+# standard deviations of the flow beyond which a difference is no noise
+MOVING_FLOW_STDS = 3.0
+# weight of a pixel below which the estimate does not rest on it
+UNUSED_WEIGHT = 0.5
+# grey levels by which a region fits its flow better than the camera's motion: shown by
+# ``hybridvo show`` on a scene with smooth walls
+MOVING_GREY_LEVELS = 3.0
+# fractions of the image, and of its width, that a region needs to be outlined
+MIN_REGION_AREA = 0.01
+MIN_REGION_THICKNESS = 0.02
+# px, of the window in which grey levels are averaged before regions are outlined
+MOVING_BLUR_PX = 5
 
 PARTS = ("rotation", "translation")
 """The two halves of a motion with six components, as a network predicts it."""

@@ -18,7 +18,6 @@ from torch import nn
 from hybridvo.core.checks import check_kind
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import FramePair, PairBatch
-from hybridvo.network.calibration import INVALID_LOG_SCALE
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.paper import layers
 from hybridvo.network.paper.layers import (
@@ -28,6 +27,7 @@ from hybridvo.network.paper.layers import (
 )
 from hybridvo.network.paper.normalization import MotionScale, normalize
 from hybridvo.network.pwvo import scaled
+from hybridvo.network.selection import INVALID_LOG_SCALE
 from hybridvo.network.weights import read_network_of
 
 # channels of the decoder at full width: of its last layers, and of those before

@@ -12,13 +12,15 @@ import torch
 from hybridvo.core.errors import InputError
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.torch_geometry import se3
-from hybridvo.network.calibration import (
-    MIN_FIT_SCALE,
-    SHARPNESS,
-)
 from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.network.selection import rotation_log_scale, select_motion
 from hybridvo.solver.torch.factors import Pixels, fit_pixels
+
+# weights are exp(-4 s), s the log scale of the uncertainty: errors on one moving
+# object are alike, and one on two thirds of the image must not outweigh the rest
+SHARPNESS = 4.0
+# of the kernel of a fit, over the focal length: 0.1 px at 1000 px
+MIN_FIT_SCALE = 1e-4
 
 # logit of a pixel that must not take part: its weight is 0 in any precision
 EXCLUDED_LOGIT = -1e4

@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 from hybridvo import __version__
 from hybridvo.core.errors import did_you_mean, printable
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
-from hybridvo.run.calibration import DOCTOR_SECONDS
 from hybridvo.run.commands import dispatch
 from hybridvo.run.commands.dispatch import Outcome, calling
+
+# s that the doctor looks at a live camera: 150 frames, two turns to and fro
+DOCTOR_SECONDS = 5.0
 
 FLOWS = ("auto", "file", "dis")
 NETWORK = "onnx:"

@@ -20,26 +20,22 @@ from hybridvo.core.errors import InputError, printable
 from hybridvo.core.files import versions
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.providers import contradiction, dis_flow, file_flow, with_flow
-from hybridvo.io.calibration import LIVE_RATE_HZ
 from hybridvo.io.cameras.base import LiveCamera
 from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.io.cameras.folder import FolderCamera
-from hybridvo.io.cameras.settings import read_preset
+from hybridvo.io.cameras.settings import LIVE_RATE_HZ, read_preset
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.resolution import resolution_question
 from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.calibration import (
-    DOCTOR_SECONDS,
     EMPTY_DEPTH,
-    MAX_CONTRADICTED,
     MAX_SCALE_ERROR,
     MIN_FOCUS,
-    MIN_PATH_LENGTH_M,
-    MIN_SCALE_PAIRS,
     MIN_TEXTURE,
     MIN_VALID_DEPTH,
 )
+from hybridvo.run.commands.arguments import DOCTOR_SECONDS
 from hybridvo.run.commands.compare import methods_to_run
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.capture import Captured, capture
@@ -63,6 +59,13 @@ from hybridvo.solver.depths import compare_depths
 from hybridvo.tracking.calibration import MAX_FOCAL_ERROR
 from hybridvo.tracking.camera_drift import MIN_CAMERA_STEPS, FocalDrift, bends_of
 from hybridvo.tracking.odometry import Odometry, warm_up
+
+# pairs with a true motion from which the scale of depth is judged
+MIN_SCALE_PAIRS = 6
+# m, of a true motion that shows the scale: motion capture errs by as much
+MIN_PATH_LENGTH_M = 0.01
+# fraction of the pairs whose flow may contradict their images without a report
+MAX_CONTRADICTED = 0.2
 
 COLUMNS = (
     "depth",

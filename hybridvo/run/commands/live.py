@@ -31,12 +31,9 @@ from hybridvo.core.files import (
 from hybridvo.core.options import NETWORK, Options
 from hybridvo.core.results import Step
 from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow
-from hybridvo.io.calibration import (
-    LIVE_RATE_HZ,
-    RATE_STEPS,
-)
 from hybridvo.io.cameras.base import LiveCamera, warnings_of
-from hybridvo.io.live import LiveStep, LiveStream, stream
+from hybridvo.io.cameras.settings import LIVE_RATE_HZ
+from hybridvo.io.live import RATE_STEPS, LiveStep, LiveStream, stream
 from hybridvo.io.live_rate import AutoRate
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.io.viewer.address import parse_address
@@ -45,7 +42,6 @@ from hybridvo.io.viewer.scene import Sink
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
-from hybridvo.run.calibration import LIVE_RECORDING_S
 from hybridvo.run.commands.advice import advice_on
 from hybridvo.run.commands.run_folder import (
     ALL_RESULTS,
@@ -56,6 +52,10 @@ from hybridvo.run.commands.run_folder import (
 from hybridvo.run.commands.stopping import StopRequest, stop_requested
 from hybridvo.run.commands.terminal import STYLES
 from hybridvo.tracking.odometry import Odometry
+
+# s over which the images of a Rerun recording are spread where a run has no end:
+# ten minutes, with an image every second
+LIVE_RECORDING_S = 600.0
 
 TRAJECTORY = "trajectory.tum"
 STEPS = LIVE_STEPS

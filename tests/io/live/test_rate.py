@@ -11,10 +11,11 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core.options import load_options
 from hybridvo.io import live_rate
-from hybridvo.io.calibration import MIN_POSES_HZ, RATE_FRAMES
 from hybridvo.io.cameras.base import EndOfFrames, Reading, rate_of
 from hybridvo.io.live import LiveStep, LiveStream, stream
 from hybridvo.io.live_rate import (
+    MIN_POSES_HZ,
+    RATE_FRAMES,
     AutoRate,
     RateKeeper,
     rate_by_stamps,

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.io.calibration import (
+from hybridvo.io.cameras.base import Reading
+from hybridvo.io.live import (
     MAX_OLD_FRAMES,
     MAX_STANDING_STAMPS,
+    LiveStep,
+    LiveStream,
+    Patience,
+    stream,
 )
-from hybridvo.io.cameras.base import Reading
-from hybridvo.io.live import LiveStep, LiveStream, Patience, stream
 from tests.io.live.scripted import (
     LONG_S,
     QUICK,

@@ -11,16 +11,13 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Frame
-from hybridvo.io.calibration import (
-    LIVE_WAIT_S,
-    MAX_SILENCE_S,
-)
 from hybridvo.io.cameras.base import (
     EndOfFrames,
     LiveCamera,
     Reading,
     warnings_of,
 )
+from hybridvo.io.live import LIVE_WAIT_S, MAX_SILENCE_S
 
 MAX_CAPTURED = 300
 """Frames that are kept at most; 300 of 640x480 take 0.7 GB."""

@@ -10,12 +10,14 @@ from hybridvo.core.geometry import rotation_angle
 from hybridvo.core.results import Reason, Step
 from hybridvo.core.types import Frame
 from hybridvo.run.calibration import (
-    CLOCK_SHIFT_PX,
     MIN_FOCUS,
     MIN_TEXTURE,
     MIN_VALID_DEPTH,
 )
 from hybridvo.run.commands.diagnosis.inspection import sharpness, valid_fraction
+
+# px by which depth lies beside the image from which the clocks are a likely cause
+CLOCK_SHIFT_PX = 2.0
 
 REPEATED = "repeated_frame"
 UNIT = "depth_unit"

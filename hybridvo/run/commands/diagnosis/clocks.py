@@ -18,15 +18,19 @@ from scipy.ndimage import gaussian_filter1d
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Frame
 from hybridvo.run.calibration import (
-    CLOCK_SIGMAS,
     CLOCK_SMOOTHING,
     MAX_CLOCK_OFFSET_S,
     MAX_CLOCK_STD_S,
     MIN_CLOCK_CORRELATION,
-    MIN_CLOCK_MOTION_PX,
-    MIN_CLOCK_PAIRS,
 )
 from hybridvo.run.commands.diagnosis.answer import Answer
+
+# pairs in a row from which the clocks are compared: half a second
+MIN_CLOCK_PAIRS = 15
+# px of 320 a frame, of the image's motion, from which they are
+MIN_CLOCK_MOTION_PX = 0.5
+# standard deviations by which an offset must differ from 0
+CLOCK_SIGMAS = 3.0
 
 WORKING_WIDTH = 320
 """Width to which images are reduced, pixels."""

@@ -7,14 +7,18 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.run.calibration import (
-    EDGE_SURROUNDINGS_PX,
-    MAX_EDGE_DISPLACEMENT,
-    MAX_EDGE_GRADIENT,
-    MIN_DEPTH_EDGE,
-    MIN_TEXTURE_GRADIENT,
-    STRONG_EDGE_PERCENTILE,
-)
+# relative step of depth between neighbours that an image shows as an edge
+MIN_DEPTH_EDGE = 0.05
+# grey levels per pixel: above the noise of a camera
+MIN_TEXTURE_GRADIENT = 2.0
+# of the gradients, from which edges are strong enough to judge focus
+STRONG_EDGE_PERCENTILE = 95
+# grey levels per pixel: one bright edge does not count more than others
+MAX_EDGE_GRADIENT = 10.0
+# fraction of width and height within which a displacement is looked for
+MAX_EDGE_DISPLACEMENT = 0.15
+# px, of the side of the surroundings whose mean gradient is subtracted
+EDGE_SURROUNDINGS_PX = 31
 
 
 class Sharpness(NamedTuple):

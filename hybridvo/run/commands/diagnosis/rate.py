@@ -7,11 +7,13 @@ import numpy as np
 from hybridvo.run.calibration import (
     MAX_JITTER,
     MAX_LATE_SHARE,
-    MIN_RATE_RATIO,
     STAMP_GAP_FACTOR,
 )
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.capture import Captured
+
+# of the rate of a live camera to the one requested, from which it holds
+MIN_RATE_RATIO = 0.9
 
 
 def gaps(stamps: np.ndarray) -> Answer:

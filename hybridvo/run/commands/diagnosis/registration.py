@@ -12,14 +12,17 @@ from hybridvo.core.types import Frame
 from hybridvo.run.calibration import (
     CERTAIN_REGISTRATION_STDS,
     CERTAIN_ZOOM_STDS,
-    MAX_EDGE_DISPLACEMENT,
-    MIN_SHIFT_PX,
     NEEDED_REGISTRATION_GAIN,
     NORMAL_REGISTRATION_SHIFT,
 )
 from hybridvo.run.commands.diagnosis.answer import Answer
-from hybridvo.run.commands.diagnosis.inspection import edge_agreement
+from hybridvo.run.commands.diagnosis.inspection import (
+    MAX_EDGE_DISPLACEMENT,
+    edge_agreement,
+)
 
+# px: small images that are off by less are not reported
+MIN_SHIFT_PX = 2.0
 ZOOMS = (0.88, 0.9, 0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08, 1.1, 1.12)
 """Factors by which depth is enlarged about the centre of the image, and compared with it."""
 ZOOM_FRAMES = 10

@@ -19,9 +19,11 @@ from hybridvo.core.stages import (
 from hybridvo.core.types import Frame
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.run.calibration import SPEED_FRAMES
 from hybridvo.run.commands.demo import HEIGHT, SCENE, WIDTH
 from hybridvo.tracking.odometry import Odometry
+
+# frames that are tracked, of the demo a third: some seconds
+SPEED_FRAMES = 60
 
 DEMO = "scene of the demo"
 """What is tracked where no sequence is named."""
