@@ -16,10 +16,12 @@ import numpy as np
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.core.options import Options, SearchOptions
 from hybridvo.hypotheses.calibration import (
+    DISTINCT_MOTION_PX,
     INLIER_REMOVAL_CUTOFF,
     INLIER_REMOVAL_GAIN,
     REESTIMATED_MIN_SCORE,
 )
+from hybridvo.hypotheses.cues import MIN_INLIER_NOISE_PX
 from hybridvo.hypotheses.proposals import (
     CANDIDATE_ANNEALING,
     CANDIDATE_MIN_START_PX,

@@ -27,8 +27,6 @@ from hybridvo.run.commands.diagnosis.answer import Answer
 
 # pairs in a row from which the clocks are compared: half a second
 MIN_CLOCK_PAIRS = 15
-# px of 320 a frame, of the image's motion, from which they are
-MIN_CLOCK_MOTION_PX = 0.5
 # standard deviations by which an offset must differ from 0
 CLOCK_SIGMAS = 3.0
 
@@ -69,10 +67,7 @@ def one_clock(sequence: Any, pairs: int) -> Answer:
         count = MIN_CLOCK_PAIRS + 1
         return Answer(None, f"fewer than {count} frames in a row have both")
     colour, depth = measured
-    moved = float(np.linalg.norm(colour.steps.std(axis=0)))
     remedy = "turn the camera to and fro while you record"
-    if moved < MIN_CLOCK_MOTION_PX:
-        return Answer(None, f"the camera hardly moves: {remedy}")
     offset = find_offset(colour, depth)
     if offset is None or offset.correlation < MIN_CLOCK_CORRELATION:
         text = "colour and depth do not move alike: too little motion of the camera"

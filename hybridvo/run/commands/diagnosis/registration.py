@@ -21,8 +21,6 @@ from hybridvo.run.commands.diagnosis.inspection import (
     edge_agreement,
 )
 
-# px: small images that are off by less are not reported
-MIN_SHIFT_PX = 2.0
 ZOOMS = (0.88, 0.9, 0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08, 1.1, 1.12)
 """Factors by which depth is enlarged about the centre of the image, and compared with it."""
 ZOOM_FRAMES = 10
@@ -58,7 +56,7 @@ def registration(maps: list[np.ndarray]) -> Answer:
     text = f"edges of depth lie {_in_words(best)} of those in the images"
     m, n = (size // 2 for size in agreement.shape)
     longer_side = max(m, n) / MAX_EDGE_DISPLACEMENT
-    limit = max(MIN_SHIFT_PX, NORMAL_REGISTRATION_SHIFT * longer_side)
+    limit = NORMAL_REGISTRATION_SHIFT * longer_side
     is_near = np.hypot(best.right, best.down) <= limit
     radius = round(limit)
     near = agreement[m - radius : m + radius + 1, n - radius : n + radius + 1]
