@@ -4,7 +4,7 @@ row gets the same batches.
     python tools/ablation.py --out runs/ablation --seeds 0 1 2
     python tools/ablation.py --out runs/full --recipe configs/ablation/recipes/full.yaml
     python tools/ablation.py --out runs/gpu --recipe configs/ablation/recipes/gpu.yaml \
-        --seeds 0 1 2 --device cuda --processes 6 --workers 10
+        --seeds 0 1 2 --device cuda --workers 10
 
 A row is a file of configs/ablation; ``--recipe`` lays another size and optimiser
 over all rows. The rows that decide the paper's order have several seeds, the others
@@ -13,10 +13,6 @@ reader sees whether an order is significant. Started again with the same ``--out
 continues where it stopped: each row's state is ``OUT/ROW-seedN`` (checkpoint.pt,
 log.jsonl, result.json, and at the end weights.safetensors). ``OUT/ablation.json``
 is written after every score, with all rows in the folder.
-
-On a GPU a row this small waits for its own launches. ``--processes`` therefore trains
-the rows of all seeds at once, spread over processes that share one stream of batches;
-the seed is then that of the weights alone.
 """
 
 from __future__ import annotations
@@ -25,18 +21,14 @@ import argparse
 import dataclasses
 import functools
 import json
-import signal
 import sys
-from collections.abc import Iterator, Sequence
-from multiprocessing.connection import Connection
+from collections.abc import Sequence
 from pathlib import Path
-from queue import Full
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-import torch.multiprocessing
 from measuring import parser_of, provenance
 
 from hybridvo.core.errors import HybridVOError, InputError
@@ -93,13 +85,8 @@ def _parser() -> argparse.ArgumentParser:
     samples_help = "training samples of every row"
     add("--samples", type=int, default=100_000, help=samples_help)
     add("--count", type=int, default=500, help="held-out pairs of each preset")
-    add("--threads", type=int, default=1, help="threads of torch")
     workers_help = "processes that draw samples (0: this one)"
     add("--workers", type=int, default=0, help=workers_help)
-    processes_help = "train all rows at once, spread over so many processes"
-    add("--processes", type=int, default=0, help=processes_help)
-    later_help = "train alone; without it, started again, the rows are scored"
-    add("--score-later", action="store_true", help=later_help)
     add("--device", choices=("cpu", "cuda"), default="cpu")
     return parser
 
@@ -110,20 +97,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns its exit code (2 bad input, 5 no output, 130 interrupted).
     """
     args = _parser().parse_args(argv)
-    torch.set_num_threads(args.threads)
+    torch.set_num_threads(1)
     torch.backends.cudnn.benchmark = True
     # samples are small: threads inside OpenCV cost more than they give
     cv2.setNumThreads(0)
     try:
         names = chosen_rows(args)
-        if args.processes:
-            train_at_once(args, names)
-        else:
-            # the current update is finished, and a checkpoint is written
-            with stop_requested() as stop:
-                ablation = Ablation(args, stop)
-                for seed in args.seeds:
-                    ablation.train(rows_of_seed(names, seed), seed)
+        # the current update is finished, and a checkpoint is written
+        with stop_requested() as stop:
+            ablation = Ablation(args, stop)
+            for seed in args.seeds:
+                ablation.train(rows_of_seed(names, seed), seed)
     except HybridVOError as error:
         print(f"ablation.py: {error}", file=sys.stderr)
         return error.exit_code
@@ -208,8 +192,6 @@ class Row:
 
         Returns whether it was due.
         """
-        if self.args.score_later:
-            return False
         milestone = self._milestone()
         curve = self.result["curve"]
         if milestone is None or str(milestone) in curve:
@@ -324,107 +306,6 @@ class Ablation:
                 write_json(self.args.out / "ablation.json", summary(self.args))
             if first.trainer.step == last or self.stop.number:
                 break
-
-
-# --- training in several processes ------------------------------------------------
-
-NumberedBatch = tuple[int, TrainingBatch | None]
-"""A batch and the number of updates that came before it; None ends the training."""
-QUEUED_BATCHES = 4
-"""Batches that may wait for a process."""
-
-
-def train_at_once(args: argparse.Namespace, names: Sequence[str]) -> None:
-    """Train the rows of all seeds in processes that share a stream of batches."""
-    jobs = [
-        (name, seed) for seed in args.seeds for name in rows_of_seed(names, seed)
-    ]
-    # this process draws the batches and never uses the device
-    task = task_of(args, *jobs[0])
-    if not args.score_later:
-        # each process inherits the held-out pairs
-        pairs_of(task.options.data_size, args.count)
-    # handles of shared memory are files, of which a process may open few
-    torch.multiprocessing.set_sharing_strategy("file_system")
-    context = torch.multiprocessing.get_context("fork")
-    shares = [jobs[first :: args.processes] for first in range(args.processes)]
-    queues = []
-    processes = []
-    steps = []
-    for share in shares:
-        queue = context.Queue(QUEUED_BATCHES)
-        receiver, sender = context.Pipe(duplex=False)
-        process = context.Process(
-            target=_train_share, args=(args, share, queue, sender), daemon=True
-        )
-        process.start()
-        queues.append(queue)
-        processes.append(process)
-        steps.append(receiver)
-    try:
-        first = min(receiver.recv() for receiver in steps)
-        for numbered in _numbered_batches(task, first, args.workers):
-            for queue, process in zip(queues, processes, strict=True):
-                _put(queue, numbered, process)
-        for process in processes:
-            process.join()
-    finally:
-        for process in processes:
-            process.terminate()
-    write_json(args.out / "ablation.json", summary(args))
-
-
-def _numbered_batches(
-    task: PaperTask, first: int, workers: int
-) -> Iterator[NumberedBatch]:
-    """The batches of a task from update ``first`` on, then None."""
-    steps = task.options.steps
-    stream = task.batches(first * task.options.batch_size, workers)
-    for number in range(first, steps):
-        yield number, next(stream)
-    yield steps, None
-
-
-def _put(queue: Any, numbered: NumberedBatch, process: Any) -> None:
-    """Hand over a batch as soon as there is room.
-
-    Raises:
-        HybridVOError: the process ended before it had all.
-    """
-    while True:
-        try:
-            return queue.put(numbered, timeout=10.0)
-        except Full:
-            if not process.is_alive():
-                raise HybridVOError(
-                    "a process of the training ended; its message is above. Start the tool "
-                    "again to continue."
-                ) from None
-
-
-def _train_share(
-    args: argparse.Namespace,
-    jobs: Sequence[tuple[str, int]],
-    batches: Any,
-    step: Connection,
-) -> None:
-    """Train some rows on the batches of a queue, each from where it stopped."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    rows = [Row(args, name, seed) for name, seed in jobs]
-    step.send(min(row.trainer.step for row in rows))
-    while True:
-        number, batch = batches.get()
-        if batch is None:
-            break
-        due = [row for row in rows if row.trainer.step == number]
-        batch = batch.to(args.device)
-        for row in due:
-            row.trainer.advance(batch)
-            row.score()
-    for row in rows:
-        row.trainer.save()
-        # a row that was trained before
-        row.score()
 
 
 # --- results ----------------------------------------------------------------------

@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +31,9 @@ from golden_cases.figures import (
     summarise,
 )
 from golden_cases.quick import cases, measure_quick
-from golden_cases.scenes import Known, prior_of
-from known_pairs import HEAVY, Case, groups, rendered
+from known_pairs import Case, groups, rendered
 from measuring import ROOT, parser_of, processor, revision
 
-PRIOR_KINDS = ("true", "before", "wrong")
-PRIOR_PAIRS = 10
-PRIOR_METHODS = ("classical", "hybrid-flow", "hybrid")
 WALK_FRAMES = 12
 WALK_SIZE = (480, 640)
 METHODS = {
@@ -46,9 +41,6 @@ METHODS = {
         "dis": ("classical", "hybrid-flow", "hybrid", "pwvo"),
         "true": ("classical", "hybrid-flow"),
     },
-    "scenario": {"made": ("classical", "hybrid-flow")},
-    "degenerate": {"made": ("classical", "hybrid")},
-    "model": {"made": ("classical",)},
     "real": {"file": ("classical", "hybrid"), "dis": ("classical", "hybrid")},
 }
 """First word of a group -> flow -> methods that are measured pair by pair."""
@@ -64,11 +56,7 @@ def main(argv: list[str] | None = None) -> int:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(to_text(new), encoding="utf-8")
         return 0
-    frozen = args.against
-    if frozen is None:
-        frozen = (
-            ROOT / "docs" / ("golden_quick.json" if args.quick else "golden.json")
-        )
+    frozen = ROOT / "docs" / ("golden_quick.json" if args.quick else "golden.json")
     findings = compare(json.loads(frozen.read_text(encoding="utf-8")), new)
     for finding in findings:
         print(finding)
@@ -89,12 +77,6 @@ def build_parser() -> argparse.ArgumentParser:
         type=Path,
         metavar="FILE",
         help="write figures here, compare nothing",
-    )
-    parser.add_argument(
-        "--against",
-        type=Path,
-        metavar="FILE",
-        help="figures to compare with; docs/golden.json, docs/golden_quick.json",
     )
     parser.add_argument(
         "--data", type=Path, default=ROOT / "../shared/data", metavar="DIR"
@@ -182,11 +164,6 @@ def works_of(group: str, seeds: int) -> dict[str, Callable[[list[Case]], Row]]:
             works[f"{group}/{flow}/{method}"] = partial(
                 pairs, flow=flow, method=method, seeds=seeds
             )
-    if group in HEAVY:
-        for method, kind in product(PRIOR_METHODS, PRIOR_KINDS):
-            works[f"prior_{kind}/{group}/{method}"] = partial(
-                with_prior, method=method, kind=kind
-            )
     return works
 
 
@@ -205,24 +182,6 @@ def pairs(some: list[Case], flow: str, method: str, seeds: int) -> Row:
     if seeds > 1:
         row["spread"] = spread([summarise(each) for each in records])
     return row
-
-
-def with_prior(some: list[Case], method: str, kind: str) -> Row:
-    """Figures with a prior, and under ``without`` those of the same pairs without one."""
-    from hybridvo import estimate
-
-    records = []
-    without = []
-    for case in some[:PRIOR_PAIRS]:
-        pair = case.pairs["dis"]
-        truth = case.T_curr_prev, case.depth, pair
-        if kind == "before" and case.T_before is None:
-            continue
-        known = Known(pair, case.T_curr_prev, case.depth, case.T_before)
-        prior = prior_of(known, kind)
-        records.append(record(estimate(pair, method=method, prior=prior), *truth))
-        without.append(record(estimate(pair, method=method), *truth))
-    return summarise(records) | {"without": summarise(without)}
 
 
 def track(method: str, seeds: int) -> Row:

@@ -49,18 +49,9 @@ class Case(NamedTuple):
 
 def groups(data: Path) -> dict[str, Callable[[], Iterator[Case]]]:
     """Name of every group -> what makes its cases; with the recordings that ``data`` holds."""
-    from hybridvo.lab.synthetic.noise_scenarios import (
-        DEGENERATE_SCENARIOS,
-        MAIN_SCENARIOS,
-    )
-
     made: dict[str, Callable[[], Iterator[Case]]] = {
         kind: partial(heavy, kind) for kind in HEAVY
     }
-    made |= {f"scenario_{name}": partial(scenario, name) for name in MAIN_SCENARIOS}
-    weak = (*DEGENERATE_SCENARIOS, *UNDETERMINED)
-    made |= {f"degenerate_{name}": partial(degenerate, name) for name in weak}
-    made["model_noise"] = model_noise
     there = [name for name in REAL if (data / name).is_dir()]
     return made | {
         f"real_{name.split('/')[-1]}": partial(real, data, name) for name in there
@@ -126,28 +117,6 @@ def real(data: Path, name: str) -> Iterator[Case]:
     flows = {"file": file_flow(sequence)} if sequence.has_flow else {}
     wanted = list(range(0, len(sequence) - 1, REAL[name]))
     return from_sequence(sequence, flows | {"dis": dis_flow()}, wanted)
-
-
-def scenario(name: str) -> Iterator[Case]:
-    """Pairs without images: known noise, moving objects, gross errors of the flow."""
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
-
-    for seed in range(5):
-        pair, truth = make_pair(name, seed)
-        yield Case({"made": pair}, truth["T_curr_prev"], truth["depth_true"])
-
-
-def model_noise() -> Iterator[Case]:
-    """Static pairs whose noise is what the refinement assumes: the covariance must be right."""
-    from hybridvo.lab.synthetic.noise_scenarios import make_model_pair
-
-    for seed in range(60):
-        pair, truth = make_model_pair(seed)
-        yield Case(
-            {"made": pair},
-            truth["T_curr_prev"],
-            truth["depth_true"].astype(np.float32),
-        )
 
 
 def degenerate(kind: str) -> Iterator[Case]:

@@ -5,7 +5,7 @@ their pixels, and the path.
 
 First a rendered scene in which objects cover more than half of the image, then
 TartanAir (CC BY 4.0, TartanAir by CMU's AirLab) with two rendered objects in it. Flow
-is OpenCV DIS; depth is the renderer's. ``--frames DIR`` also writes each picture as PNG.
+is OpenCV DIS; depth is the renderer's.
 """
 
 from __future__ import annotations
@@ -80,7 +80,6 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, default=Path("docs/teaser.gif"), metavar="FILE")
-    add("--frames", type=Path, metavar="DIR", help="each picture as PNG as well")
     return parser
 
 
@@ -94,10 +93,6 @@ def main(argv: list[str] | None = None) -> int:
         pictures += [draw(part, index) for index in range(count)]
         times_ms += [round(1000 * seconds / count)] * count
     write_gif(pictures, times_ms, args.out)
-    if args.frames is not None:
-        args.frames.mkdir(parents=True, exist_ok=True)
-        for number, picture in enumerate(pictures):
-            picture.save(args.frames / f"{number:02d}.png")
     print(args.out, args.out.stat().st_size)
     return 0
 

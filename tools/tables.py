@@ -41,8 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown := set(args.only) - {part.name for part in PARTS}:
         print(f"tables.py: unknown parts {', '.join(sorted(unknown))}; see --list.")
         return 2
-    done = {commit} | ({args.keep} if args.keep else set())
-    due = [part for part in wanted if commit_of(part) not in done]
+    due = [part for part in wanted if commit_of(part) != commit]
     if args.list:
         for part in wanted:
             print(described(part, "due" if part in due else "measured"))
@@ -73,11 +72,6 @@ def build_parser() -> argparse.ArgumentParser:
         default=[],
         metavar="PART,PART",
         help="default: all",
-    )
-    add(
-        "--keep",
-        metavar="COMMIT",
-        help="parts that name this commit are not measured again either",
     )
     add(
         "--kind",

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from maker_pairs import CALIBRATION, TEST, Maker
+from maker_pairs import TEST
 from measuring import add_workers, measured, parser_of, provenance, store
 
 from bench.semi_real import Estimator, measure, summarise
@@ -29,7 +29,6 @@ def build_parser() -> argparse.ArgumentParser:
     add("--pairs", type=int, default=120, help="of makers without a fixed number")
     add("--methods", default=",".join(METHODS))
     add("--makers", help="some of them, separated by a semicolon; default: all")
-    add("--calibration", action="store_true", help="those of the calibration")
     add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
@@ -40,8 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     args.data = args.data.absolute()
-    makers = makers_of(args)
-    names = args.makers.split(";") if args.makers else list(makers)
+    names = args.makers.split(";") if args.makers else list(TEST)
     found = measured(
         args, "makers", partial(rows_of, args), {name: name for name in names}
     )
@@ -54,15 +52,10 @@ def main(argv: list[str] | None = None) -> int:
             method: summarise(rows, method) for method in args.methods.split(",")
         }
         for method, row in summary[name].items():
-            print(name, method, short(row), flush=True)
+            print(name, method, row, flush=True)
     result = provenance("benchmark.py makers", argv) | {"makers": summary}
     store(args.out, result)
     return 0
-
-
-def makers_of(args: argparse.Namespace) -> dict[str, Maker]:
-    """The makers that are measured by default."""
-    return CALIBRATION if args.calibration else TEST
 
 
 def rows_of(args: argparse.Namespace, name: str) -> list[dict[str, Any]]:
@@ -74,17 +67,7 @@ def rows_of(args: argparse.Namespace, name: str) -> list[dict[str, Any]]:
     }
     drawn = (
         known
-        for known in makers_of(args)[name](args.data, args.pairs)
+        for known in TEST[name](args.data, args.pairs)
         if known.pair.flow is not None
     )
     return measure(drawn, methods)
-
-
-def short(row: dict) -> str:
-    """The figures of a row that fit in a line."""
-    wrong = row["wrong"]
-    return (
-        f"wrong {wrong['count']}/{wrong['of']}, of these ok {row['wrong_ok']['count']}, "
-        f"right not ok {row['right_not_ok']['count']}, AUROC {row['auroc']}, "
-        f"calibration error {row['ece']}, {row['median_px_right']} px"
-    )

@@ -123,8 +123,6 @@ def standing(data: Path) -> Iterator[dict[str, Any]]:
             tracked = track(frames, mode)
             poses = np.stack([step.T_world_cam for step in tracked.steps])
             distances = np.linalg.norm(poses[:, :3, 3], axis=1)
-            cosines = (np.trace(poses[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-            angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
             steps = tracked.steps[1:]
             yield {
                 "recording": name,
@@ -133,9 +131,7 @@ def standing(data: Path) -> Iterator[dict[str, Any]]:
                 "with_flow": sum(map(uses_flow, steps)),
                 "not_ok": sum(not step.ok for step in steps),
                 "worst_cm": digits(100 * distances.max()),
-                "worst_deg": digits(angles.max()),
                 "ms_median": digits(np.median(tracked.ms[1:])),
-                "ms_95": digits(np.percentile(tracked.ms[1:], 95)),
             }
 
 

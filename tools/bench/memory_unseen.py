@@ -19,19 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from measuring import parser_of, provenance, store
 
+from bench import objects
 from bench.memory import MODES, Judged, counted, judged
 from hybridvo import Frame
 from hybridvo.core.geometry import invert
-from hybridvo.lab.synthetic.scenes import Scene, make_scene
 from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
-from hybridvo.lab.synthetic.slow_scenes import (
-    noisy_image,
-    slow_scene,
-    structured_light,
-)
 
-SIZE = (240, 320)
-"""Rows and columns of the rendered images."""
 SCENE_FRAMES = 12
 CLIP_FRAMES = 10
 CLIP_SEED = 777
@@ -46,29 +39,15 @@ class Rendered(NamedTuple):
     """Rendered scenes of one family."""
 
     family: str
-    is_slow: bool  # at the rate of a video; else in steps of some centimetres
+    rate: str  # "slow": that of a video; "fast": steps of some centimetres
     first_seed: int
-
-    @property
-    def name(self) -> str:
-        """As in the table."""
-        return f"{self.family}, {'slow' if self.is_slow else 'fast'}"
-
-    def scene(self, seed: int) -> Scene:
-        """One of them."""
-        if self.is_slow:
-            return slow_scene(self.family, seed, SCENE_FRAMES, SIZE)
-        height, width = SIZE
-        return make_scene(
-            self.family, seed, height=height, width=width, frames=SCENE_FRAMES
-        )
 
 
 RENDERED = (
-    Rendered("escalator", False, 770_001),
-    Rendered("escalator", True, 770_101),
-    Rendered("heavy_rigid", True, 770_201),
-    Rendered("heavy_deforming", True, 770_301),
+    Rendered("escalator", "fast", 770_001),
+    Rendered("escalator", "slow", 770_101),
+    Rendered("heavy_rigid", "slow", 770_201),
+    Rendered("heavy_deforming", "slow", 770_301),
 )
 
 
@@ -103,7 +82,9 @@ def main(argv: list[str] | None = None) -> int:
     result["rows"] = []
     for family in RENDERED:
         seeds = range(family.first_seed, family.first_seed + args.scenes)
-        result["rows"] += rows(family.name, map(partial(rendered, family), seeds))
+        result["rows"] += rows(
+            f"{family.family}, {family.rate}", map(partial(rendered, family), seeds)
+        )
     if args.clips:
         recordings = load_split(args.data, "test")
         some = (clip(recordings, number) for number in range(1, args.clips + 1))
@@ -126,17 +107,16 @@ def rows(name: str, recorded: Iterator[Recorded]) -> Iterator[dict[str, Any]]:
 
 def rendered(family: Rendered, seed: int) -> Recorded:
     """A rendered scene as a sensor gives it."""
-    scene = family.scene(seed)
-    rng = np.random.default_rng(seed)
-    frames = []
-    for index in range(scene.frames):
-        exact = scene.render(index)
-        rgb = noisy_image(exact.rgb, rng)
-        depth = structured_light(scene.depth(index), rng)
-        frames.append(Frame(rgb, depth, exact.camera, exact.timestamp, index))
-    return Recorded(
-        frames, scene.T_world_cam, lambda start, _: scene.object_id(start) > 0
-    )
+    seen = list(objects.rendered(family.family, family.rate, seed, SCENE_FRAMES))
+    poses = [np.eye(4)]
+    for each in seen[1:]:
+        poses.append(poses[-1] @ invert(each.T_curr_prev))
+
+    def moving_in(start: int, _: int) -> np.ndarray:
+        masks = [known.mask for known in seen[start].known.values()]
+        return np.logical_or.reduce([np.zeros(objects.SIZE, bool), *masks])
+
+    return Recorded([each.frame for each in seen], np.array(poses), moving_in)
 
 
 def clip(recordings: Any, number: int) -> Recorded:

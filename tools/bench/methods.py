@@ -45,7 +45,6 @@ from scipy.stats import gmean
 from bench.costs import costs
 from bench.thresholds import thresholds
 from bench.video_rate import video_rate
-from hybridvo.core.geometry import rotation_angle
 
 FLOW_ONLY = (
     "hybrid-flow",
@@ -84,8 +83,7 @@ ORACLE = "classical-oracle-static-mask"
 FLOWS = ("dis", "true")
 """Flows of the rendered scenes."""
 REAL_PAIRS = 40
-"""Pairs of a recorded sequence, from its start: a chain without holes
-has an error at its end."""
+"""Pairs of a recorded sequence, from its start."""
 
 Estimator = Callable[[Any], Any]
 """From a pair to its motion."""
@@ -295,9 +293,7 @@ def masked(static: np.ndarray) -> Estimator:
 
 
 def real(args: argparse.Namespace) -> dict[str, Any]:
-    """Recorded sequences below the data folder: flow files
-    where there are any, and DIS.
-    """
+    """Recorded sequences below the data folder, on DIS flow."""
     _, missing = estimators(REAL_METHODS)
     absent = [name for name in REAL if not (args.data / name).is_dir()]
     folders = {
@@ -308,49 +304,31 @@ def real(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def real_sequence(folder: Path) -> dict[str, Any]:
-    """Figures of each method on a recorded sequence, by flow."""
+    """Figures of each method on a recorded sequence."""
     from hybridvo import open_sequence
-    from hybridvo.flow.providers import dis_flow, file_flow
+    from hybridvo.flow.providers import dis_flow
 
     methods, _ = estimators(REAL_METHODS)
     sequence = open_sequence(folder)
-    providers = {"dis": dis_flow()}
-    if sequence.has_flow:
-        label = "file (true)" if sequence.flow_is_true else "file"
-        providers = {label: file_flow(sequence)} | providers
     return {
         "frames": len(sequence),
         "depth": sequence.depth_source,
-        "flows": {
-            label: real_rows(sequence, provider, methods)
-            for label, provider in providers.items()
-        },
+        "flows": {"dis": real_rows(sequence, dis_flow(), methods)},
     }
 
 
 def real_rows(
     sequence: Any, provider: Any, methods: dict[str, Estimator]
 ) -> dict[str, Any]:
-    """Figures of each method over the pairs, and its error at the end."""
+    """Figures of each method over the pairs."""
     from hybridvo import iter_pairs
 
     records: Records = {method: [] for method in methods}
-    T_end = {method: np.eye(4) for method in methods}
-    T_end_true = np.eye(4)
     for pair in itertools.islice(iter_pairs(sequence, provider), REAL_PAIRS):
         i = pair.prev.index
         T = np.linalg.inv(sequence.poses[i + 1]) @ sequence.poses[i]
-        T_end_true = T @ T_end_true
-        motions = answer(records, methods, pair, T, pair.prev.depth)
-        for method, motion in motions.items():
-            T_end[method] = motion.T_curr_prev @ T_end[method]
-    rows = summaries(records)
-    for method, row in rows.items():
-        error = T_end[method] @ np.linalg.inv(T_end_true)
-        angle_deg = np.rad2deg(rotation_angle(error[:3, :3]))
-        row["end_rotation_deg"] = digits(angle_deg)
-        row["end_translation_cm"] = digits(100 * np.linalg.norm(error[:3, 3]))
-    return rows
+        answer(records, methods, pair, T, pair.prev.depth)
+    return summaries(records)
 
 
 # --- the demo ---------------------------------------------------------------------
@@ -413,21 +391,16 @@ def answer(
     pair: Any,
     T_true: np.ndarray,
     depth: np.ndarray,
-) -> dict[str, Any]:
-    """Each method's motion of a pair.
-
-    Its score and time are appended to the records.
+) -> None:
+    """Append each method's score and time on a pair to the records.
 
     A method's first call is made twice, so that its set-up is not timed.
     """
-    motions = {}
     for name, method in methods.items():
         if not records[name]:
             method(pair)
         motion, ms = timed(lambda method=method: method(pair))
         records[name].append(score(motion, T_true, depth, pair) | {"ms": ms})
-        motions[name] = motion
-    return motions
 
 
 def summaries(records: Records) -> dict[str, dict[str, Any]]:

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo import Camera, Frame, FramePair, Odometry, chain_covariance
 from hybridvo.baselines import estimate
-from hybridvo.core.geometry import backproject, invert, rotation_angle
+from hybridvo.core.geometry import invert, rotation_angle
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.lab.synthetic.turned_windows import (
     TripodRecording,
@@ -50,10 +50,6 @@ OFF_CM = 1.0
 OFF_DEG = 0.15
 """Errors of a step from which an ``ok`` one counts as wrong: the floor of
 the recordings shakes by 0.03 degrees."""
-NEAR_M = 4.0
-VOXEL_M = 0.03
-REACH_M = 0.15
-"""Settings of small_gicp: points nearer than 4 m, of every second pixel."""
 COLOURS = {
     "hybridvo": "#0072B2",
     "OpenCV RGB-D odometry": "#D55E00",
@@ -187,10 +183,12 @@ def answer(frames: Sequence[Frame], R_true: np.ndarray) -> dict[str, Path6]:
     answers["OpenCV PnP-RANSAC, best limit"] = best(by_limit)
     if importlib.util.find_spec("small_gicp"):
         by_start = {
-            "identity as start": chained(icp(frames, is_predicted=False)),
-            "constant velocity as start": chained(icp(frames, is_predicted=True)),
+            "identity as start": [motion_of("small-gicp", pair) for pair in pairs],
+            "constant velocity as start": predicted(pairs),
         }
-        answers["small_gicp"] = best(by_start)
+        answers["small_gicp"] = best(
+            {name: chained(motions) for name, motions in by_start.items()}
+        )
     return answers
 
 
@@ -210,33 +208,14 @@ def motion_of(
     return invert(motion.T_curr_prev)
 
 
-def icp(frames: Sequence[Frame], is_predicted: bool) -> Motions:
-    """T_prev_curr by small_gicp's GICP on the points of the depth maps."""
-    import small_gicp
-
-    clouds = [points_of(frame) for frame in frames]
+def predicted(pairs: Sequence[FramePair]) -> Motions:
+    """T_prev_curr by small_gicp, each from the motion before."""
     T = np.eye(4)
     motions = []
-    for prev, curr in itertools.pairwise(clouds):
-        result = small_gicp.align(
-            prev,
-            curr,
-            T if is_predicted else np.eye(4),
-            registration_type="GICP",
-            downsampling_resolution=VOXEL_M,
-            max_correspondence_distance=REACH_M,
-        )
-        T = np.asarray(result.T_target_source)
-        motions.append(T)
+    for pair in pairs:
+        T = estimate("small-gicp", pair, start=T).T_curr_prev
+        motions.append(invert(T))
     return motions
-
-
-def points_of(frame: Frame) -> np.ndarray:
-    """(n, 3) metres: points of every second pixel, not far away."""
-    assert frame.depth is not None
-    points = backproject(frame.depth, frame.camera)[::2, ::2].reshape(-1, 3)
-    is_used = (points[:, 2] > 0) & (points[:, 2] < NEAR_M)
-    return points[is_used].astype(np.float64)
 
 
 def chained(motions: Motions) -> np.ndarray:

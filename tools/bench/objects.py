@@ -13,17 +13,16 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from measuring import OUTSIDE, digits, parser_of, provenance, store, timed
+from measuring import OUTSIDE, digits, parser_of, provenance, store
 
 from bench.memory import CLIPS as RECORDINGS
 from bench.memory import LEAST_WRONG_PX, clip_folders
-from hybridvo import Frame, MovingObject, Odometry, Options, Step, open_sequence
+from hybridvo import Frame, MovingObject, Odometry, Step, open_sequence
 from hybridvo.core.geometry import (
     backproject,
     invert,
@@ -32,7 +31,6 @@ from hybridvo.core.geometry import (
     se3_log,
     transform_points,
 )
-from hybridvo.core.options import TrackOptions
 from hybridvo.io.masks import object_colour
 from hybridvo.lab.synthetic.render import Scene, Solid
 from hybridvo.lab.synthetic.scenes import make_scene
@@ -82,7 +80,6 @@ def build_parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=14, help="of each scene")
     add("--clips", action="store_true", help="of recordings as well")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
-    add("--memory", default="auto", choices=("auto", "off"))
     add(
         "--out",
         type=Path,
@@ -110,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
             counts = Counts()
             for seed in range(args.seed0, args.seed0 + args.seeds):
                 frames = rendered(family, rate, seed, args.frames)
-                counts.follow(frames, args.memory)
+                counts.follow(frames)
             rows.append({"frames of": f"{family}, {rate}"} | counts.summary())
             print(rows[-1], flush=True)
         result[family] = origin | {"rows": rows}
@@ -120,7 +117,7 @@ def main(argv: list[str] | None = None) -> int:
             counts = Counts(RIGHT_RECORDED_PX)
             for folder in clip_folders(args.data, recording):
                 if folder.name.partition("_")[2] in KINDS:
-                    counts.follow(recorded(folder), args.memory)
+                    counts.follow(recorded(folder))
             rows.append({"frames of": f"clips, {recording}"} | counts.summary())
             print(rows[-1], flush=True)
         result["clips"] = origin | {"rows": rows}
@@ -130,7 +127,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def draw(path: Path, frames: Iterator[Seen]) -> None:
     """Draw some frames of a scene: the image, and each object in its colour with its number."""
-    odometry = Odometry(options=_options("auto", "auto"))
+    odometry = Odometry()
     columns = []
     for k, seen in enumerate(frames):
         step = odometry.track(seen.frame)
@@ -171,22 +168,15 @@ class Counts:
         self.frames = 0
         self.wrong_camera = 0
         self.wrong_and_ok = 0
-        self.with_objects_ms: list[float] = []
-        self.without_ms: list[float] = []
 
-    def follow(self, frames: Iterator[Seen], memory: str) -> None:
-        """Track a sequence with objects and without."""
-        on = Odometry(options=_options("auto", memory))
-        off = Odometry(options=_options("off", memory))
-        on.warm_up()
+    def follow(self, frames: Iterator[Seen]) -> None:
+        """Track a sequence."""
+        odometry = Odometry()
         last: dict[int, int] = {}
         for k, seen in enumerate(frames):
-            step, ms = timed(partial(on.track, seen.frame))
-            _, ms_off = timed(partial(off.track, seen.frame))
+            step = odometry.track(seen.frame)
             if k == 0:
                 continue
-            self.with_objects_ms.append(ms)
-            self.without_ms.append(ms_off)
             self.frames += 1
             if _is_wrong(step, seen, self.right_px):
                 self.wrong_camera += 1
@@ -234,13 +224,7 @@ class Counts:
             "within_3_sigma": _fraction(self.within, self.sure),
             "motions": self.sure,
             "false": int(self.false),
-            "ms_median": digits(np.median(self.with_objects_ms)),
-            "ms_median_without": digits(np.median(self.without_ms)),
         }
-
-
-def _options(objects: Any, memory: Any) -> Options:
-    return Options(track=TrackOptions(objects=objects, memory=memory))
 
 
 def _fraction(part: int, of: int) -> float | None:

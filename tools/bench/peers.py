@@ -88,7 +88,6 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--parts", default=",".join(PARTS), help="default: %(default)s")
     add("--methods", default=",".join(METHODS), help="default: %(default)s")
-    add("--frames", type=int, default=1000, help="of a recording, at most")
     add("--video-frames", type=int, default=60, help="of a rendered scene")
     add("--seed", type=int, default=9400, help="of the rendered scenes")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
@@ -140,7 +139,7 @@ def recordings(
         folders += [("tripod", f"tripod/{name}") for name in TRIPOD]
     for part, name in folders:
         if (args.data / name).is_dir():
-            yield from_disk(part, args.data / name, args.frames)
+            yield from_disk(part, args.data / name)
         else:
             absent.append(name)
     if "video" in parts:
@@ -148,10 +147,10 @@ def recordings(
             yield rendered(kind, args.seed, args.video_frames)
 
 
-def from_disk(part: str, folder: Path, max_frames: int) -> Recording:
+def from_disk(part: str, folder: Path) -> Recording:
     """A recording with its true poses; a camera on a tripod stands still."""
     sequence = open_sequence(folder)
-    indices = range(min(len(sequence), max_frames))
+    indices = range(len(sequence))
     T = np.tile(np.eye(4), (len(indices), 1, 1))
     if part != "tripod":
         assert sequence.poses is not None

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,14 +120,6 @@ ROWS: dict[str, Callable[[Looked], Start]] = {
 def build_parser() -> argparse.ArgumentParser:
     parser = parser_of(__file__, __doc__)
     add = parser.add_argument
-    add(
-        "--every",
-        type=int,
-        default=1,
-        metavar="N",
-        help="only each N-th pair of a clip",
-    )
-    add("--weights", default="pwvo", metavar="FILE", help="of PWVO")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add("--out", type=Path, metavar="FILE")
     add_workers(parser)
@@ -141,7 +131,7 @@ def main(argv: list[str] | None = None) -> int:
     args.data = args.data.absolute()
     sources = sources_of(args.data)
     items = {source.name: source for source in sources}
-    found = measured(args, "sources", partial(rows_of, args), items)
+    found = measured(args, "sources", rows_of, items)
     sets = {}
     for name in ("heavy", *CLIPS):
         pairs = [row for s in sources if s.set == name for row in found[s.name]]
@@ -182,11 +172,11 @@ def sources_of(data: Path) -> list[Source]:
     return sources
 
 
-def rows_of(args: argparse.Namespace, source: Source) -> list[dict[str, Any]]:
+def rows_of(source: Source) -> list[dict[str, Any]]:
     """The errors of a source's pairs, of which PWVO finds any motion."""
-    network = PWVO.from_pretrained(args.weights)
+    network = PWVO.from_pretrained()
     rows = []
-    for known in islice(source.pairs(), 0, None, args.every):
+    for known in source.pairs():
         if known.pair.flow is None:
             continue
         look = look_at_pair(network, known.pair)

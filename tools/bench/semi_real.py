@@ -184,15 +184,10 @@ def measure(
 
 def answer_row(motion: Any, drawn: Any, static: StaticPart) -> dict[str, Any]:
     """The figures of one answer."""
-
-    def error_px(T: np.ndarray) -> float:
-        return ego_flow_error(T, drawn.T_curr_prev, static.depth, drawn.pair)
-
-    error = error_px(motion.T_curr_prev)
-    others = [error_px(each.T_curr_prev) for each in motion.hypotheses]
+    truth = (drawn.T_curr_prev, static.depth, drawn.pair)
+    error = ego_flow_error(motion.T_curr_prev, *truth)
     return {
         "px": digits(error),
-        "best_px": digits(min([error, *others])),
         "wrong": bool(error > allowed_error_px(static.oracle_px)),
         "status": motion.status.state.value,
         "reason": motion.status.reason.value,
@@ -211,12 +206,6 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
     right = ~wrong
     ok = np.array([each["status"] == "ok" for each in answers])
     probability = np.array([each["probability"] for each in answers])
-    no_hypothesis = np.array(
-        [
-            row[method]["best_px"] > allowed_error_px(row["oracle_px"])
-            for row in rows
-        ]
-    )
     right_px = [each["px"] for each in answers if not each["wrong"]]
 
     def fraction(what: np.ndarray, among: np.ndarray) -> dict[str, Any]:
@@ -226,7 +215,6 @@ def summarise(rows: list[dict[str, Any]], method: str) -> dict[str, Any]:
         "wrong": fraction(wrong, moving),
         "wrong_static_majority": fraction(wrong, moving & static_majority),
         "wrong_static": fraction(wrong, ~moving),
-        "wrong_best_hypothesis": fraction(no_hypothesis, moving),
         "right_not_ok": fraction(~ok, right & moving),
         "right_not_ok_static": fraction(~ok, right & ~moving),
         "wrong_ok": fraction(ok, wrong),

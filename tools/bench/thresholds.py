@@ -46,15 +46,12 @@ def thresholds(args: argparse.Namespace) -> dict[str, Any]:
     """
     methods, missing = methods_here(METHODS)
     heavy = heavy_grid(methods, range(args.seed0, args.seed0 + args.sequences))
-    print("thresholds: heavy", file=sys.stderr, flush=True)
-    demo = demo_grid(methods)
-    print("thresholds: demo", file=sys.stderr, flush=True)
     return {
         "seeds": [args.seed0, args.seed0 + args.sequences - 1],
         "grid_px": list(GRID_PX),
         "missing": missing,
         "heavy": heavy,
-        "demo": demo,
+        "demo": demo_grid(methods),
         "multiples": multiples(methods, range(args.seed0, args.seed0 + args.pairs)),
     }
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,6 @@ from measuring import (
     proportion,
     provenance,
     store,
-    timed,
 )
 
 from hybridvo import FramePair, Options, RelativePose, estimate, open_sequence
@@ -44,15 +42,12 @@ RECORDINGS: dict[str, tuple[int, ...]] = {
 RIGHT_DEG = 2.0
 RIGHT_M = 0.05
 
-Solve = Callable[[FramePair], RelativePose]
-
 
 class Answer(NamedTuple):
     """An answer about one pair."""
 
     is_right: bool
     is_ok: bool
-    ms: float
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -102,12 +97,14 @@ def row_of(steps: Steps) -> dict[str, Any]:
     return {"recording": steps.name, "stride": steps.stride} | row
 
 
-def competitors() -> dict[str, Solve]:
+def competitors() -> dict[str, Callable[[FramePair], RelativePose]]:
     """The methods by the name of their row."""
     without = Options(search=SearchOptions(matches="off"))
     return {
-        "hybrid": partial(estimate, method="hybrid"),
-        "without matches": partial(estimate, method="hybrid", options=without),
+        "hybrid": lambda pair: estimate(pair.prev, pair.curr),
+        "without matches": lambda pair: estimate(
+            pair.prev, pair.curr, options=without
+        ),
         "SIFT, PnP-RANSAC": by_matches,
     }
 
@@ -119,7 +116,10 @@ def by_matches(pair: FramePair) -> RelativePose:
 
 
 def measure(
-    path: Path, stride: int, count: int, methods: dict[str, Solve]
+    path: Path,
+    stride: int,
+    count: int,
+    methods: dict[str, Callable[[FramePair], RelativePose]],
 ) -> dict[str, Any]:
     """Every method on the pairs of a recording that are ``stride`` frames apart."""
     answers: dict[str, list[Answer]] = {name: [] for name in methods}
@@ -129,24 +129,17 @@ def measure(
         lengths.append(float(np.linalg.norm(T[:3, 3])))
         angles.append(float(np.degrees(rotation_angle(T[:3, :3]))))
         for name, solve in methods.items():
-            motion, ms = timed(partial(solve_images, solve, pair))
+            motion = solve(pair)
             error = motion.T_curr_prev @ invert(T)
             is_near = float(np.linalg.norm(error[:3, 3])) <= RIGHT_M
             is_aligned = np.degrees(rotation_angle(error[:3, :3])) <= RIGHT_DEG
             is_right = bool(is_near and is_aligned and motion.usable)
-            answers[name].append(Answer(is_right, motion.ok, ms))
+            answers[name].append(Answer(is_right, motion.ok))
     return {
         "step_cm": digits(100 * np.median(lengths)),
         "step_deg": digits(np.median(angles)),
         "methods": {name: figures(given) for name, given in answers.items()},
     }
-
-
-def solve_images(solve: Solve, pair: FramePair) -> RelativePose:
-    """The answer of a method that computes flow by itself, or of one that needs none."""
-    if isinstance(solve, partial):
-        return solve(pair.prev, pair.curr)  # type: ignore[call-arg]
-    return solve(pair)
 
 
 def pairs_of(
@@ -164,13 +157,10 @@ def pairs_of(
 
 
 def figures(answers: list[Answer]) -> dict[str, Any]:
-    """Right answers, wrong ones that are ok, and milliseconds."""
+    """Right answers, and wrong ones that are ok."""
     right = sum(answer.is_right for answer in answers)
     believed = sum(answer.is_ok and not answer.is_right for answer in answers)
-    flagged = sum(answer.is_right and not answer.is_ok for answer in answers)
     return {
         "right": proportion(right, len(answers)),
         "wrong_ok": believed,
-        "right_not_ok": flagged,
-        "ms": digits(np.median([answer.ms for answer in answers])),
     }

@@ -25,7 +25,6 @@ from golden_cases.scenes import (
     scene_pair,
     scene_pairs,
     still_pair,
-    walk,
 )
 
 Run = Callable[[int], list[Record]]
@@ -149,13 +148,8 @@ def turned_flow_of_noisy_images(seed: int) -> list[Record]:
 # -- depth that is not that of the motion --------------------------------------
 
 
-def late_depth(seed: int) -> list[Record]:
-    """A second depth map that is taken later and later than its image."""
-    return answered(late_pairs(), "classical", seed)
-
-
 def late_noisy_depth(seed: int) -> list[Record]:
-    """The same with noise, under which the depth maps fit each other little better elsewhere."""
+    """A second depth map, noisy, that is taken later and later than its image."""
     rng = np.random.default_rng(1)
     known = []
     for late in late_pairs():
@@ -332,19 +326,6 @@ def patches_in_a_static_scene(seed: int) -> list[Record]:
     return found
 
 
-def noisy_images(seed: int) -> list[Record]:
-    """Images of a static scene that get noisier: the motion is less and less precise."""
-    from hybridvo import estimate
-
-    found = []
-    for known in moving_pairs():
-        for std in (4.0, 8.0, 12.0):
-            pair = with_grey_noise(known.pair, std)
-            answer = estimate(pair.prev, pair.curr, method="hybrid", seed=seed)
-            found.append(record(answer, known.T_curr_prev, known.depth, known.pair))
-    return found
-
-
 def with_moving_patch(pair: Any, share: float) -> Any:
     """Return a pair in whose second image a square piece stands 4 px aside."""
     height, width = pair.prev.camera.shape
@@ -378,58 +359,10 @@ def prior_of_an_object(seed: int) -> list[Record]:
     return found
 
 
-def no_rigid_motion(seed: int) -> list[Record]:
-    """A flow that is bent until no motion in it is believed any more."""
-    from hybridvo.lab.synthetic.draws import smooth_field
-
-    pairs = []
-    for scenario, number in (("moving50", 1), ("moving70", 0)):
-        known = made_pair(scenario, number)
-        rng = np.random.default_rng(1)
-        field = smooth_field(rng, known.depth.shape, 6, 2)
-        for reach_px in np.arange(2.5, 4.1, 0.25):
-            flow = known.pair.flow + np.float32(reach_px) * field
-            pairs.append(known._replace(pair=replace(known.pair, flow=flow)))
-    return answered(pairs, "hybrid-flow", seed)
-
-
-def rolling_shutter(seed: int) -> list[Record]:
-    """Second images whose rows are read one after another, slower from rung to rung."""
-    from hybridvo import estimate
-
-    path = walk("static", 901)
-    found = []
-    for first in (0, 8):
-        for rows_in_frames in (0.0, 0.05, 0.1, 0.15, 0.2, 0.3):
-            curr = read_row_by_row(path.exact[first + 3 :], rows_in_frames)
-            prev = path.exact[first]
-            answer = estimate(prev, curr, method="hybrid", seed=seed)
-            T = motion(path.T_world_cam, first, first + 3)
-            pair = with_true_flow(prev, curr, T).pair
-            found.append(record(answer, T, prev.depth, pair))
-    return found
-
-
-def read_row_by_row(frames: Sequence[Any], over: float) -> Any:
-    """Return a frame whose last row is that of a frame so many later."""
-    first = frames[0]
-    height = first.camera.height
-    rgb = first.rgb.copy()
-    if over:
-        for row in range(height):
-            at = over * row / height
-            before = frames[int(at)].rgb[row].astype(np.float64)
-            after = frames[int(at) + 1].rgb[row].astype(np.float64)
-            rgb[row] = np.rint(before + (at - int(at)) * (after - before))
-    return replace(first, rgb=rgb)
-
-
 # -- errors of the flow that neighbours share ----------------------------------
 
 
-def coherent_flow(
-    cells: int, along: tuple[float, float], seed: int
-) -> list[Record]:
+def coherent_flow(seed: int) -> list[Record]:
     """Static pairs whose flow has a smooth error beside white noise."""
     from hybridvo.lab.synthetic.draws import smooth_field
 
@@ -437,28 +370,23 @@ def coherent_flow(
     for number in range(8):
         known = still_pair(20 + number, 0.1, 0.01)
         rng = np.random.default_rng([12, number])
-        field = smooth_field(rng, known.depth.shape, cells, 2) * np.float32(along)
+        field = np.float32(0.05) * smooth_field(rng, known.depth.shape, 8, 2)
         pair = replace(known.pair, flow=known.pair.flow + field)
         curr = replace(pair.curr, depth=None)
         pairs.append(known._replace(pair=replace(pair, curr=curr)))
     return answered(pairs, "classical", seed)
 
 
-def dis_flow_of(size: tuple[int, int], percentile: int, seed: int) -> list[Record]:
+def dis_flow_of(percentile: int, seed: int) -> list[Record]:
     """DIS flow beside the true flow; ``std`` is a percentile of what it states, 1e-3 px."""
     from hybridvo.flow.providers import dis_flow
 
-    known = flow_pair(size)
+    known = scene_pair(made_scene("light", 900, 2, (300, 400)), 0)
     found = dis_flow()(known.pair.prev, known.pair.curr)
     error = np.linalg.norm(found.flow - known.pair.flow, axis=2)
     std = np.sqrt(np.percentile(found.variance[found.valid], percentile))
     median = float(np.nanmedian(error[found.valid]))
     return [labelled("flow", error=median, std=1e3 * float(std))]
-
-
-@functools.cache
-def flow_pair(size: tuple[int, int]) -> Known:
-    return scene_pair(made_scene("light", 900, 2, size), 0)
 
 
 def little_texture(seed: int) -> list[Record]:
@@ -507,7 +435,6 @@ LADDERS: dict[tuple[str, str], Run] = {
     ("turned_flow", "slow"): partial(turned_flow, 0.0, SLOW_SHIFTS_PX),
     ("turned_flow", "fast"): partial(turned_flow, 8.0, FAST_SHIFTS_PX),
     ("turned_flow", "noisy"): turned_flow_of_noisy_images,
-    ("late_depth", "classical"): late_depth,
     ("late_depth", "noisy"): late_noisy_depth,
     ("frozen_images", "noisy_depth"): noisy_depth_of_frozen_images,
     ("two_depths", "spread"): depth_spread,
@@ -516,21 +443,13 @@ LADDERS: dict[tuple[str, str], Run] = {
     ("narrow_view", "classical"): narrow_view_of_a_plane,
     ("little_depth", "classical"): frames_with_little_depth,
     ("moving_patch", "hybrid"): patches_in_a_static_scene,
-    ("noisy_images", "hybrid"): noisy_images,
-    ("no_rigid_motion", "hybrid-flow"): no_rigid_motion,
     ("baseline_noise", "unstated"): partial(stated_noise, "noisy", None),
     ("baseline_noise", "half"): partial(stated_noise, "noisy", 0.25),
     ("baseline_noise", "tiny"): partial(stated_noise, "moving30", 0.01),
     ("prior_of_an_object", "classical"): prior_of_an_object,
-    ("rolling_shutter", "hybrid"): rolling_shutter,
-    ("coherent_flow", "short"): partial(coherent_flow, 24, (0.06, 0.06)),
-    ("coherent_flow", "medium"): partial(coherent_flow, 8, (0.05, 0.05)),
-    ("coherent_flow", "long"): partial(coherent_flow, 4, (0.05, 0.05)),
-    ("coherent_flow", "vertical"): partial(coherent_flow, 8, (0.0, 0.06)),
-    ("dis_flow", "small_low"): partial(dis_flow_of, (300, 400), 10),
-    ("dis_flow", "small_high"): partial(dis_flow_of, (300, 400), 90),
-    ("dis_flow", "large_low"): partial(dis_flow_of, (400, 500), 10),
-    ("dis_flow", "large_high"): partial(dis_flow_of, (400, 500), 90),
+    ("coherent_flow", "medium"): coherent_flow,
+    ("dis_flow", "small_low"): partial(dis_flow_of, 10),
+    ("dis_flow", "small_high"): partial(dis_flow_of, 90),
     ("little_texture", "flow"): little_texture,
 }
 """Name of a ladder and of its variant -> what climbs it."""

@@ -61,7 +61,7 @@ def cases() -> dict[str, Run]:
     runs: dict[str, Run] = {}
     for kind in SCENES:
         for method in IMAGE_METHODS:
-            runs[f"{kind}/{method}"] = partial(by_images, (kind,), method)
+            runs[f"{kind}/{method}"] = partial(by_images, kind, method)
     for method in NETWORK_METHODS:
         runs[f"network/{method}"] = partial(by_network, method)
     for number, of in enumerate(WALKS):
@@ -95,12 +95,9 @@ def cases() -> dict[str, Run]:
 # -- rendered scenes -----------------------------------------------------------
 
 
-def by_images(kinds: Sequence[str], method: str, seed: int) -> list[Record]:
+def by_images(kind: str, method: str, seed: int) -> list[Record]:
     """Return records of pairs of images and depth, whose flow is that of DIS."""
-    found = []
-    for kind in kinds:
-        found += from_frames(scene_pairs(kind), method, seed)
-    return found
+    return from_frames(scene_pairs(kind), method, seed)
 
 
 def from_frames(

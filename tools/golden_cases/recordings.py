@@ -50,11 +50,11 @@ def recording(images: Sequence[np.ndarray], depths: Sequence[np.ndarray]) -> Any
     return Recording()
 
 
-def doctors_word(sequence: Any, finding: str) -> Record:
+def doctors_word(sequence: Any, finding: str, pairs: int = 3) -> Record:
     """Return what the doctor says about one thing in a recording."""
     from hybridvo.run.commands.doctor import diagnose
 
-    report = diagnose(sequence, pairs=len(sequence))
+    report = diagnose(sequence, pairs=pairs)
     states = {each["name"]: each["state"] for each in report["findings"]}
     return labelled(states[finding])
 
@@ -76,26 +76,17 @@ def blocks(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return np.repeat(rgb[..., None], 3, axis=2), depth.astype(np.float32)
 
 
-def little_depth(seed: int) -> list[Record]:
-    """Depth on ever fewer pixels of every frame."""
+def little_depth(shares: Sequence[float], whole: int, seed: int) -> list[Record]:
+    """Depth on ever fewer pixels, beside some frames with all of it or in every frame."""
     rgb, depth = blocks()
-    order = np.random.default_rng(15).permutation(depth.size).reshape(depth.shape)
+    # the number of the draw is that of the frozen figures
+    rng = np.random.default_rng(16 if whole else 15)
+    order = rng.permutation(depth.size).reshape(depth.shape)
     found = []
-    for share in (0.15, 0.125, 0.115, 0.085, 0.073, 0.06):
+    for share in shares:
         few = np.where(order < share * depth.size, depth, np.float32(np.nan))
-        made = recording([rgb, rgb], [few, few])
-        found.append(doctors_word(made, "valid depth"))
-    return found
-
-
-def empty_frames(seed: int) -> list[Record]:
-    """Depth on ever fewer pixels of one frame among others."""
-    rgb, depth = blocks()
-    order = np.random.default_rng(16).permutation(depth.size).reshape(depth.shape)
-    found = []
-    for share in (0.016, 0.0125, 0.0115, 0.0085, 0.0074, 0.006):
-        few = np.where(order < share * depth.size, depth, np.float32(np.nan))
-        made = recording([rgb, rgb, rgb], [few, depth, depth])
+        depths = [few] + [depth] * whole if whole else [few, few]
+        made = recording([rgb] * len(depths), depths)
         found.append(doctors_word(made, "valid depth"))
     return found
 
@@ -134,26 +125,18 @@ def blurred_images(seed: int) -> list[Record]:
     return found
 
 
-def shifted_depth(seed: int) -> list[Record]:
-    """Depth that lies ever farther beside its image."""
+def shifted_depth(
+    shifts: Sequence[int], heights: Sequence[int], seed: int
+) -> list[Record]:
+    """Depth of which ever more rows lie beside their image, or ever farther."""
     rgb, depth = blocks()
     found = []
-    for shift in range(0, 8):
-        moved = np.roll(depth, shift, axis=1)
-        made = recording([rgb, rgb], [moved, moved])
-        found.append(doctors_word(made, "depth beside images"))
-    return found
-
-
-def partly_shifted_depth(seed: int) -> list[Record]:
-    """Depth of which an ever larger part lies beside its image."""
-    rgb, depth = blocks()
-    found = []
-    for rows in range(HEIGHT // 3, HEIGHT, 6):
-        moved = depth.copy()
-        moved[:rows] = np.roll(depth[:rows], 12, axis=1)
-        made = recording([rgb, rgb], [moved, moved])
-        found.append(doctors_word(made, "depth beside images"))
+    for shift in shifts:
+        for rows in heights:
+            moved = depth.copy()
+            moved[:rows] = np.roll(depth[:rows], shift, axis=1)
+            made = recording([rgb, rgb], [moved, moved])
+            found.append(doctors_word(made, "depth beside images"))
     return found
 
 
@@ -186,17 +169,8 @@ def late_frames(
             intervals[: round(share * (frames - 1))] = times
             made = recording([rgb] * frames, [depth] * frames)
             made.timestamps = np.concatenate([[0.0], np.cumsum(intervals)])
-            found.append(stamps_word(made))
+            found.append(doctors_word(made, "time stamps", pairs=1))
     return found
-
-
-def stamps_word(sequence: Any) -> Record:
-    """Return what the doctor says about the time stamps of a recording."""
-    from hybridvo.run.commands.doctor import diagnose
-
-    report = diagnose(sequence, pairs=1)
-    states = {each["name"]: each["state"] for each in report["findings"]}
-    return labelled(states["time stamps"])
 
 
 def wrong_limits(kind: str, metres: float, seed: int) -> list[Record]:
@@ -228,16 +202,7 @@ def far_positions(seed: int) -> list[Record]:
     from hybridvo.lab.evaluation.metrics import evaluate
 
     found = []
-    for metres in (
-        0.5e12,
-        0.6e12,
-        0.75e12,
-        0.9e12,
-        1.1e12,
-        1.25e12,
-        1.4e12,
-        1.6e12,
-    ):
+    for metres in 1e12 * np.array([0.5, 0.6, 0.75, 0.9, 1.1, 1.25, 1.4, 1.6]):
         poses = np.tile(np.eye(4), (4, 1, 1))
         poses[:, 0, 3] = np.linspace(0.0, metres, 4)
         path = Trajectory(np.arange(4.0), poses)
@@ -250,12 +215,18 @@ def far_positions(seed: int) -> list[Record]:
 
 
 RECORDINGS: dict[tuple[str, str], Run] = {
-    ("doctor", "little_depth"): little_depth,
-    ("doctor", "empty_frames"): empty_frames,
+    ("doctor", "little_depth"): partial(
+        little_depth, (0.15, 0.125, 0.115, 0.085, 0.073, 0.06), 0
+    ),
+    ("doctor", "empty_frames"): partial(
+        little_depth, (0.016, 0.0125, 0.0115, 0.0085, 0.0074, 0.006), 2
+    ),
     ("doctor", "little_texture"): little_texture,
     ("doctor", "blur"): blurred_images,
-    ("doctor", "shifted_depth"): shifted_depth,
-    ("doctor", "partly_shifted"): partly_shifted_depth,
+    ("doctor", "shifted_depth"): partial(shifted_depth, range(8), (HEIGHT,)),
+    ("doctor", "partly_shifted"): partial(
+        shifted_depth, (12,), range(HEIGHT // 3, HEIGHT, 6)
+    ),
     ("doctor", "textured_surfaces"): textured_surfaces,
     ("doctor", "late_by"): partial(late_frames, (1.2, 1.4, 1.6, 1.8, 2.2), (0.2,)),
     ("doctor", "late_shares"): partial(
