@@ -5,14 +5,12 @@ The processes import this file. What is heavy is therefore imported by the tests
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -85,17 +83,6 @@ def wait_for_ever(folder: Path, number: int) -> None:
     time.sleep(3600)
 
 
-def kernels_compiled(_: int) -> int:
-    """How many kernels a fresh process had to compile instead of reading their code."""
-    from hybridvo.solver import kernels
-    from hybridvo.tracking.odometry import warm_up
-
-    warm_up("classical")
-    functions = [each for each in vars(kernels).values() if hasattr(each, "stats")]
-    assert any(each.stats.cache_hits for each in functions)
-    return sum(sum(each.stats.cache_misses.values()) for each in functions)
-
-
 # --- workers of a scheduler, which are threads ------------------------------------
 
 
@@ -131,23 +118,6 @@ def test_a_comparison_by_workers_is_that_of_one_process(
     compare((walk, image_walk), "there", **given, workers=threads, mode="resume")
     assert len(steps) == 4
     assert [path.stat().st_mtime_ns for path in steps] == before
-
-
-@pytest.mark.slow
-def test_samples_by_workers_are_those_of_one_process(
-    threads: Workers, tmp_path: Path
-) -> None:
-    from hybridvo.lab.synthetic.dataset import read_sample
-    from hybridvo.run.commands.train import generate
-
-    here = tmp_path / "here"
-    there = tmp_path / "there"
-    for folder, workers in ((here, None), (there, threads)):
-        generate("paper", 3, folder, size=(32, 64), workers=workers)
-    for index in range(3):
-        one = read_sample(here, index)
-        two = read_sample(there, index)
-        assert all((vars(one)[name] == vars(two)[name]).all() for name in vars(one))
 
 
 def test_finished_shards_are_not_drawn_again(
@@ -231,19 +201,6 @@ def test_a_task_of_which_every_process_dies_is_given_up() -> None:
     assert "4 processes died of it" in found[1].lost
 
 
-@pytest.mark.long
-def test_a_task_of_which_every_worker_dies_is_given_up() -> None:
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=1, dashboard_address=None
-        ) as scheduler,
-    ):
-        workers = Workers(scheduler=scheduler.scheduler_address)
-        (done,) = workers.each(die, [1])
-    assert "all those workers died" in done.lost
-
-
 def test_processes_open_no_port() -> None:
     before = listening(0)
     found = [done.result for done in Workers(jobs=2).each(listening, [0, 1])]
@@ -292,52 +249,3 @@ def test_processes_end_with_the_one_that_started_them(
         main.wait()
     _, alive = psutil.wait_procs(workers, timeout=60)
     assert not alive
-
-
-@pytest.mark.long
-def test_a_worker_reads_kernels_from_the_cache() -> None:
-    from hybridvo.tracking.odometry import warm_up
-
-    warm_up("classical")
-    assert [
-        done.result for done in Workers(jobs=2).each(kernels_compiled, [0])
-    ] == [0]
-
-
-def kill_one_at_work(out: Path, kept: dict[Path, list[str]]) -> None:
-    """Wait until a run has some frames, note these, and kill the process that writes it."""
-    while not kept:
-        time.sleep(0.02)
-        for path in out.glob("runs/*/*/checkpoint.jsonl"):
-            lines = path.read_text().splitlines()
-            for process in psutil.Process().children():
-                files = [file.path for file in process.open_files()]
-                if len(lines) > 3 and str(path) in files and not kept:
-                    process.kill()
-                    kept[path.parent] = lines[:3]
-
-
-@pytest.mark.long
-def test_a_comparison_survives_a_killed_process(tmp_path: Path) -> None:
-    from hybridvo.run.commands.compare import compare
-    from tests.run.test_comparison import outcome
-    from tests.walks import write_walk
-
-    walks = [write_walk(tmp_path / name, 60) for name in ("one", "two", "three")]
-    given: dict[str, Any] = {"methods": ("classical", *METHODS), "options": BY_FILE}
-    compare(walks, tmp_path / "here", **given)
-    kept: dict[Path, list[str]] = {}
-    out = tmp_path / "there"
-    killer = threading.Thread(target=kill_one_at_work, args=(out, kept))
-    killer.start()
-    compare(walks, out, **given, workers=Workers(jobs=2))
-    killer.join()
-    assert outcome(out) == outcome(tmp_path / "here")
-    assert not list(out.glob("runs/*/*/checkpoint.jsonl"))
-    # the frames that were done before the kill were not done again: their times are kept
-    assert kept
-    for folder, lines in kept.items():
-        times = [json.loads(line)[1][0]["frame_ms"] for line in lines]
-        rows = (folder / "steps.csv").read_text().splitlines()
-        column = rows[0].split(",").index("frame_ms")
-        assert [float(row.split(",")[column]) for row in rows[1:4]] == times

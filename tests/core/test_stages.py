@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-
 import pytest
 
 import hybridvo as hvo
 from hybridvo.core import stages
-from hybridvo.core.stages import STAGES, stage, stage_summary, stage_times
+from hybridvo.core.stages import STAGES, stage, stage_times
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.commands.diagnosis.speed import measure
 
@@ -55,30 +53,6 @@ def test_a_stage_ends_where_its_function_fails(
         with stage("judge"):
             clock.work(4)
     assert times.rounded() == {"flow": 6.0, "judge": 4.0}
-
-
-def test_nobody_watches_outside_or_in_another_thread() -> None:
-    with stage("flow"):
-        pass
-    with stage_times() as times:
-        other = threading.Thread(target=stage("search")(lambda: None))
-        other.start()
-        other.join()
-    with stage("flow"):
-        pass
-    assert times.ms == {}
-
-
-def test_a_frame_without_a_stage_counts_as_nothing() -> None:
-    rows = [{"flow": 40.0, "judge": 2.0}, {"judge": 2.0}, {"judge": 5.0}]
-    summary = stage_summary(rows)
-    assert list(summary) == ["flow", "judge"]
-    assert summary["flow"]["median_ms"] == 0.0
-    assert summary["flow"]["frames"] == 1
-    # of 0, 0, 40: nine tenths of the way from the second to the third
-    assert summary["flow"]["p95_ms"] == pytest.approx(36.0)
-    assert summary["judge"]["mean_ms"] == pytest.approx(3.0)
-    assert stage_summary([]) == {}
 
 
 @pytest.mark.parametrize(

@@ -83,24 +83,6 @@ def test_the_option_keeps_the_expected_motion_back(
     assert priors_of(monkeypatch, motion_prior=False) == [None, None, None]
 
 
-def test_a_prior_that_is_handed_in_takes_the_place_of_the_expected_motion(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    recorder = Recorder()
-    monkeypatch.setitem(pipeline.METHODS, "identity", recorder)
-    vo = hybridvo.Odometry(method="identity")
-    camera = Camera(60, 60, 31.5, 23.5, 48, 64)
-    frame = Frame(
-        np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera
-    )
-    given = MotionPrior(se3_exp(np.full(6, 0.01)), 1e-4 * np.eye(6))
-    for index, prior in enumerate((None, None, given)):
-        vo.track(replace(frame, index=index, timestamp=0.1 * index), prior=prior)
-    assert recorder.priors[0] is None
-    np.testing.assert_allclose(recorder.priors[1].T_curr_prev, given.T_curr_prev)
-    np.testing.assert_allclose(recorder.priors[1].covariance, given.covariance)
-
-
 def test_a_prior_that_is_handed_in_decides_between_two_motions() -> None:
     pair, T_camera = worlds.world(
         noise=(0.1, 0.002), texture=False, second_depth=False
@@ -190,18 +172,3 @@ def test_hybrid_holds_a_given_flow_against_the_images(
     curr = replace(wrong.curr, rgb=None, depth=None)
     assert hybridvo.estimate(replace(wrong, prev=prev, curr=curr)).ok
     assert not hybridvo.estimate(wrong).ok
-
-
-# Stamps
-
-
-def test_stamps_a_tenth_of_a_second_apart_are_not_the_same() -> None:
-    stamps = np.arange(5.0)
-    poses = np.stack(
-        [se3_exp(np.array([k, k * k, 0.1 * k, 0, 0, 0])) for k in stamps]
-    )
-    truth = hybridvo.Trajectory(stamps, poses)
-    near = hybridvo.evaluate(hybridvo.Trajectory(stamps + 0.015, poses), truth)
-    assert near["matched"] == 5 and near["ate_rmse"] < 1e-9
-    far = hybridvo.evaluate(hybridvo.Trajectory(stamps + 0.1, poses), truth)
-    assert far["matched"] == 0 and far["ate_rmse"] is None

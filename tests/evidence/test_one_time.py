@@ -9,9 +9,7 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
-from hybridvo.evidence import one_time
 from hybridvo.evidence.one_time import at_image_time
-from hybridvo.hypotheses import direct
 from tests.late_depth import (
     PERIOD_S,
     late_frames,
@@ -41,11 +39,6 @@ def test_depth_is_brought_to_the_time_of_the_image(lag_ms: float) -> None:
 
     assert wrong(late.depth, true) > 0.1
     assert wrong(moved.depth, true) < 0.3 * wrong(late.depth, true)
-
-
-def test_depth_stays_where_no_lag_is_known() -> None:
-    in_time = untold(late_frames(1, 12.0, 1))[0]
-    assert at_image_time(in_time, np.array([0, 0, 0, 0, 0.6, 0])) is in_time
 
 
 def test_a_frame_of_one_time_stays_as_it_is() -> None:
@@ -94,58 +87,6 @@ def test_a_pair_uses_readout_and_lag(readout_ms: float, share: float) -> None:
         known.append(error(frames))
         ignored.append(error(ignorant(frames)))
     assert np.mean(known) < share * np.mean(ignored)
-
-
-def test_a_tracker_keeps_rows_of_one_time() -> None:
-    frames = rolling_frames(2, 20.0, 0.0, 5)
-    true = late_frames(2, 0.0, 5)[-1]
-    tracker = hvo.Odometry()
-    for frame in frames:
-        tracker.track(frame)
-    kept = tracker.state.frame
-    assert kept is not None
-    assert kept.camera.readout_ms == 0
-    seen = kept.depth > 0
-    before = wrong(frames[-1].depth[seen], true.depth[seen])
-    assert wrong(kept.depth[seen], true.depth[seen]) < 0.5 * before
-
-
-def test_a_frame_is_brought_to_one_time_once(monkeypatch) -> None:
-    """However many pairs it takes part in, images are read anew once a frame."""
-    read = []
-    image = one_time._read_image
-
-    def counted(rgb, reading):
-        if reading is not None:
-            read.append(rgb)
-        return image(rgb, reading)
-
-    monkeypatch.setattr(one_time, "_read_image", counted)
-    tracker = hvo.Odometry()
-    frames = rolling_frames(2, 20.0, 12.0, 6)
-    for frame in frames:
-        tracker.track(frame)
-    assert len(read) <= len(frames)
-
-
-def test_the_most_reduced_images_are_followed_once(monkeypatch) -> None:
-    """As the frame was taken; what is left is sought on larger ones."""
-    begun = []
-    follow_images = direct.follow_images
-
-    def spied(pair, T, weights, planes, options, is_near):
-        begun.append(is_near)
-        return follow_images(pair, T, weights, planes, options, is_near)
-
-    monkeypatch.setattr(direct, "follow_images", spied)
-    tracker = hvo.Odometry()
-    for frame in rolling_frames(2, 20.0, 0.0, 2):
-        tracker.track(frame)
-    # nothing was expected
-    assert not any(begun[:1])
-    begun.clear()
-    assert tracker.track(rolling_frames(2, 20.0, 0.0, 3)[2]).ok
-    assert begun and all(begun)
 
 
 def test_a_tracker_keeps_depth_of_the_time_of_the_image() -> None:

@@ -9,15 +9,11 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import ego_flow, se3_exp
-from hybridvo.core.options import RefineOptions
 from hybridvo.evidence.one_time import (
-    is_of_one_time,
     pair_at_image_times,
-    rough_motion,
 )
 from hybridvo.flow.providers import with_flow
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.solver.coarse_images import follow_roughly
 from tests import worlds
 
 SIZE = (120, 160)
@@ -106,28 +102,6 @@ def test_without_readout_or_stamps_a_pair_stays_as_it_is():
     timeless = replace(frame, camera=replace(camera, readout_ms=20.0))
     pair = hvo.FramePair(timeless, timeless, None)
     assert pair_at_image_times(pair, motion) is pair
-
-
-def test_the_rough_motion_is_what_is_expected_or_else_what_is_found(pair):
-    taken = hvo.FramePair(*pair, None)
-    options = RefineOptions()
-    seen = []
-
-    def find(frames: hvo.FramePair) -> np.ndarray | None:
-        seen.append(frames)
-        return true if len(seen) == 1 else None
-
-    true = se3_exp(TWIST)
-    prior = hvo.MotionPrior(se3_exp(0.8 * TWIST), 1e-3 * np.eye(6))
-    rough = rough_motion(taken, prior, options, find)
-    np.testing.assert_array_equal(rough, follow_roughly(taken, prior, options))
-    assert np.abs(rough - prior.T_curr_prev).max() > 1e-3 and not seen
-    assert rough_motion(taken, None, options, find) is true
-    np.testing.assert_array_equal(
-        rough_motion(taken, None, options, find), np.eye(4)
-    )
-    # what is searched states no times
-    assert is_of_one_time(seen[0]) and is_of_one_time(seen[1])
 
 
 @pytest.mark.parametrize("rows", [-120.0, -500.0, 500.0, np.inf, -np.inf, np.nan])

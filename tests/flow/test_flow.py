@@ -11,7 +11,6 @@ from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.calibration import DIS_NOISE
 from hybridvo.flow.providers import (
     FlowField,
-    MeasuredFlow,
     contradiction,
     dis_flow,
     file_flow,
@@ -138,14 +137,6 @@ def test_file_flow_leads_to_the_next_frame_only() -> None:
         file_flow(Files(), strict=False)(frame(None, 2), frame(None, 3)).flow
         is None
     )
-
-
-def test_measured_flow_keeps_the_last_field_until_it_is_reset() -> None:
-    flow = MeasuredFlow(file_flow(Files()))
-    first, second = frame(None, 0), frame(None, 1)
-    assert flow(first, second) is flow.last and flow.ms > 0
-    flow.reset()
-    assert flow.last.flow is None and flow.ms == 0
 
 
 def test_fallback_names_the_source_that_answered() -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from hybridvo.core.results import Hypothesis, MotionPrior
 from hybridvo.hypotheses.calibration import CUE_WEIGHTS
-from hybridvo.hypotheses.cues import Cues, compute_cues, cue_scores, prior_scores
-from hybridvo.hypotheses.refit import mask_coverage, mask_weights
+from hybridvo.hypotheses.cues import compute_cues, cue_scores, prior_scores
+from hybridvo.hypotheses.refit import mask_coverage
 
 ROWS = 10
 COLUMNS = 20
@@ -70,13 +70,6 @@ def test_pixels_without_weight_are_in_no_cue() -> None:
     assert cues.depth_extent[0] == pytest.approx(np.log(0.03))
 
 
-def test_the_score_is_the_weighted_sum_of_all_cues() -> None:
-    assert set(CUE_WEIGHTS) == {*Cues._fields, "prior"}
-    for number, name in enumerate(Cues._fields):
-        cues = Cues(*np.eye(5)[:, [number, 0]] * [1.0, 0.0])
-        np.testing.assert_allclose(cue_scores(cues), [CUE_WEIGHTS[name], 0.0])
-
-
 def test_the_static_scene_scores_above_an_object() -> None:
     scores = cue_scores(compute_cues(*two_layers()))
     assert scores[0] > scores[1]
@@ -90,12 +83,6 @@ def test_the_prior_adds_its_agreement() -> None:
     # six standard deviations on one of six axes: 1 / (1 + 36 / 6)
     expected = CUE_WEIGHTS["prior"] * np.array([1.0, 1 / 7])
     np.testing.assert_allclose(prior_scores(motions, prior), expected)
-
-
-def test_weights_of_a_mask_rise_between_two_probabilities() -> None:
-    probability = np.array([[0.0, 0.4, 0.525], [0.65, 0.9, 1.0]])
-    expected = [[0.0, 0.0, 0.25], [0.5, 1.0, 1.0]]
-    np.testing.assert_allclose(mask_weights(probability), expected, atol=1e-7)
 
 
 def test_coverage_is_the_share_of_the_weight() -> None:

@@ -99,15 +99,6 @@ def test_a_start_leads_over_a_motion_that_is_too_far():
     assert error_px(pair, found.T_curr_prev, T) < 0.05
 
 
-@pytest.mark.parametrize("missing", ["rgb", "depth"])
-def test_an_image_without_depth_or_colour_gives_no_motion(static, missing):
-    pair = static[0]
-    assert (
-        direct_start(replace(pair, curr=replace(pair.curr, **{missing: None})))
-        is None
-    )
-
-
 def test_hybrid_asks_for_flow_only_where_the_images_do_not_suffice(static, moving):
     asked = []
 

@@ -103,16 +103,6 @@ def test_windows_give_the_motions_of_both_halves() -> None:
         assert min(error(pose, true) for pose in poses) < 1e-3
 
 
-def test_windows_without_enough_weight_are_left_out() -> None:
-    points = grid_points()
-    samples = buffer_of(points, project(points, MOTION))
-    samples[7, np.tile(np.arange(COLUMNS) >= COLUMNS // 2, ROWS)] = 0.0
-    assert 0 < len(fit_windows(samples, ROWS, COLUMNS, K)) < 12
-    # 192 pixels a window: a weight of 0.06 each is less than 12
-    samples[7] = 0.06
-    assert len(fit_windows(samples, ROWS, COLUMNS, K)) == 0
-
-
 def test_minimal_samples_find_a_motion_of_one_third() -> None:
     points = grid_points()
     targets = project(points, MOTION)

@@ -11,14 +11,12 @@ import pytest
 from hybridvo.api import estimate, refine
 from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.errors import InputError
-from hybridvo.core.geometry import ego_flow, pose_matrix, se3_exp
+from hybridvo.core.geometry import ego_flow
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, RelativePose, State
 from hybridvo.core.types import FramePair
-from hybridvo.hypotheses import select
 from hybridvo.hypotheses.calibration import NO_MOTION
 from hybridvo.hypotheses.generate import generate, static_grid
-from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
 from hybridvo.hypotheses.select import (
     Candidate,
     RefitStart,
@@ -35,7 +33,6 @@ from hybridvo.solver.refine_flow import Selection, refine_pair
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}
 IDENTITY = np.eye(4)[None]
-SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
 
 
 class Oracle:
@@ -122,24 +119,6 @@ def test_the_camera_is_fitted_where_the_mask_says(case) -> None:
     assert 0.2 < answer.inlier_ratio < 0.5
 
 
-def test_a_refit_starts_from_the_pose_that_was_selected(case, monkeypatch) -> None:
-    found, pair, truth = case
-    starts = []
-
-    def noting(samples, mask, K, pose, cutoff):
-        starts.append(pose)
-        return fit_in_mask(samples, mask, K, pose, cutoff)
-
-    monkeypatch.setattr(select, "fit_in_mask", noting)
-    true = truth["T_curr_prev"][:3]
-    oracle = Oracle(static_mask(case), refits=True, start=true)
-    ranking = rank_by_scorer(found, oracle, Options())
-    best = ranking.candidates[ranking.best]
-    assert starts and all(start is true for start in starts)
-    assert best.mask is not None and best.parent < len(found.motions)
-    assert gap(pose_matrix(best.pose), pair, truth) < 0.5
-
-
 def test_a_mask_that_leaves_too_little_makes_no_refit(case) -> None:
     found, _, _ = case
     nowhere = np.zeros(found.grid.shape[:2], np.float32)
@@ -179,27 +158,6 @@ def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
     assert answer.probability == chosen.probability
 
 
-def test_a_motion_of_the_search_is_fitted_where_it_is_static(case) -> None:
-    found, _, _ = case
-    oracle = Oracle(static_mask(case), refits=False)
-    ranking = rank_by_scorer(found, oracle, Options())
-    best = ranking.candidates[ranking.best]
-    if best.mask is None:
-        drawn = ranking.static[ranking.best]
-        np.testing.assert_array_equal(
-            ranking.mask_of(ranking.best), mask_weights(drawn)
-        )
-
-
-def test_where_the_mask_leaves_too_little_its_inliers_count(case) -> None:
-    found, _, _ = case
-    nowhere = np.zeros(found.grid.shape[:2], np.float32)
-    ranking = rank_by_scorer(found, Oracle(nowhere, refits=True), Options())
-    mask = ranking.mask_of(ranking.best)
-    inliers = select.to_hypotheses(found, ranking.candidates)[ranking.best].inliers
-    np.testing.assert_array_equal(mask, inliers)
-
-
 def test_what_one_flow_shows_stays_a_rival_in_the_next(case) -> None:
     """A motion that is alone in its flow is doubted where the first flow showed another."""
     found, _, _ = case
@@ -231,26 +189,6 @@ def test_the_pretrained_pwvo_chooses_no_worse_than_the_cues() -> None:
     wrong = {method: sum(g > 1 for g in gaps) for method, gaps in found.items()}
     assert wrong["hybrid-flow"] <= wrong["classical"] <= 2
     assert np.median(found["hybrid-flow"]) <= 1.05 * np.median(found["classical"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["true", "before", "wrong"])
-def test_a_prior_never_makes_the_answer_wrong(kind: str) -> None:
-    changes = {
-        "true": np.zeros(6),
-        "before": np.array([0.01, -0.01, 0.005, 0.002, -0.001, 0.001]),
-        "wrong": np.array([0.3, -0.2, 0.3, 0.05, -0.04, 0.03]),
-    }
-    for seed in range(504, 510):
-        pair, truth = make_pair("one60", seed)
-        plain = gap(estimate(pair, method="hybrid-flow").T_curr_prev, pair, truth)
-        prior = MotionPrior(se3_exp(changes[kind]) @ truth["T_curr_prev"], SIGMA)
-        told = gap(
-            estimate(pair, method="hybrid-flow", prior=prior).T_curr_prev,
-            pair,
-            truth,
-        )
-        assert told < max(1.2 * plain, plain + 0.05)
 
 
 def test_a_prior_needs_a_covariance() -> None:

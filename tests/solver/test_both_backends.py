@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.core.geometry import se3_exp
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, State
 from hybridvo.core.torch_geometry import se3
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.solver import kernels
 from hybridvo.solver import refine_flow as refinement
-from hybridvo.solver.noise_estimation import Noise, NoiseEstimate
+from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.status import FitSummary, status_of
 from hybridvo.solver.torch import factors
@@ -78,20 +77,6 @@ def test_the_cost_is_that_of_torch_wherever_the_pixels_are(metres: float) -> Non
     )
 
 
-def test_the_coarse_grid_is_charged_as_all_pixels_are() -> None:
-    pair, T = noisy_world()
-    weights = external_weights(pair)
-    grid = PixelGrid(pair, weights, weights.size)
-    noise = kernels.residual_noise(*NOISE, 3.0)
-    sums = np.zeros(kernels.SUMS)
-    for metres in (5.0, 30.0):
-        pose = ahead(T, metres)[:3].copy()
-        cost = kernels.sum_samples(
-            grid.samples, grid.count, pose, grid.K, noise, sums
-        )
-        assert cost == pytest.approx(grid.full_pass(pose, noise, 16).cost, rel=1e-5)
-
-
 @pytest.mark.parametrize("cutoff", [3.0, 2.0, 1.0])
 def test_inliers_are_the_weight_within_the_cutoff(cutoff: float) -> None:
     pair, T = noisy_world(movers=3)
@@ -113,25 +98,6 @@ def test_inliers_are_the_weight_within_the_cutoff(cutoff: float) -> None:
     static = ours.weights > 0.01
     ratio = weights[static].sum() / weights.sum()
     assert ours.inlier_ratio == pytest.approx(ratio * expected, abs=0.08)
-
-
-def test_a_fit_that_has_not_converged_is_degraded_by_either(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pair, T = noisy_world()
-    far = se3_exp(np.array([0.02, 0.02, 0.02, 0.006, 0.006, 0.006])) @ T
-    estimate = NoiseEstimate(Noise(0.3, 0.02), 1.0, is_depth_observable=True)
-    monkeypatch.setattr(refinement, "pair_noise", lambda *_: estimate)
-    monkeypatch.setattr(refinement, "REESTIMATE_STEPS", 0)
-    start = refinement.Selection(far, noise=NOISE)
-    found = refinement.refine_pair(pair, start)
-    assert found.status.state is State.DEGRADED
-    assert found.status.reason is Reason.SOLVER_DIVERGED
-
-
-def test_the_usual_fit_has_converged() -> None:
-    pair, T = noisy_world(movers=1)
-    assert refinement.refine_pair(pair, refinement.Selection(T)).status.ok
 
 
 RIGHT = FitSummary(

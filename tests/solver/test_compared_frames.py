@@ -13,7 +13,6 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.solver.image_factor import ImageFactor
 from hybridvo.solver.image_kernels import GREY_NOISE_FLOOR
 from hybridvo.solver.plane_kernels import fit_noise, non_negative
-from hybridvo.solver.visibility import depths_around
 from tests import worlds
 
 NUMBERS = st.floats(-4, 4).map(lambda x: round(x, 3))
@@ -65,15 +64,3 @@ def test_a_change_of_light_is_gain_and_offset() -> None:
     at = factor.first(T)
     np.testing.assert_allclose(at.gain_offset, [0.8, 5], atol=0.05)
     assert at.noise[0] < 2 * GREY_NOISE_FLOOR
-
-
-def test_depths_around_a_pixel_are_those_that_are_measured() -> None:
-    depth = np.array(
-        [[1, 2, 3, 4], [5, 0, np.inf, 8], [np.nan, -1, 0, 0], [0, 0, 0, 0]],
-        np.float32,
-    )
-    nearest, farthest = depths_around(
-        depth, np.array([0, 3, 1, 3]), np.array([0, 1, 3, 3])
-    )
-    np.testing.assert_array_equal(nearest, [1, 3, np.inf, np.inf])
-    np.testing.assert_array_equal(farthest, [5, 8, 0, 0])

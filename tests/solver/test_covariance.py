@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hybridvo.api import refine
-from hybridvo.core.geometry import invert, se3_log
-from hybridvo.core.results import Reason, State, Status
-from hybridvo.core.types import FramePair
-from hybridvo.judge.findings import Question
-from hybridvo.judge.verdict import judge
 from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.calibration import LONG_GROWTH
 from hybridvo.solver.covariance import ScoreStatistics, motion_covariance
@@ -166,25 +160,6 @@ def test_block_sums_by_hand() -> None:
     assert lost[:2].tolist() == [0.5, 0.75]
 
 
-def line(pair: FramePair) -> FramePair:
-    """The pair with depth on a slanted line three pixels wide."""
-    height, width = pair.prev.camera.shape
-    v, u = np.mgrid[0:height, 0:width]
-    off = np.abs(v - height / 2 - 0.35 * (u - width / 2)) > 1.5
-    depth = np.where(off, np.nan, pair.prev.depth).astype(np.float32)
-    return replace(
-        pair,
-        prev=replace(pair.prev, depth=depth),
-        curr=replace(pair.curr, depth=None),
-    )
-
-
-def test_a_narrow_support_is_degraded_and_a_whole_image_is_not() -> None:
-    pair, _ = make_pair("moving00", 3)
-    assert refine(pair).status.state is State.OK
-    assert refine(line(pair)).status.state is State.DEGRADED
-
-
 def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> (
     None
 ):
@@ -193,24 +168,6 @@ def test_depth_noise_that_the_flow_cannot_tell_comes_from_the_second_depth() -> 
     result = refine(pair)
     # the depths differ by 1.2 to 1.41 times the noise, as much of it as interpolation averages
     assert result.depth_noise == pytest.approx(0.02, rel=0.2)
-
-
-def test_a_degraded_motion_covers_its_doubt() -> None:
-    # the depths of both frames differ by a third: the length of the translation is as uncertain
-    pair, _ = make_pair("moving00", 4)
-    wrong = replace(pair, curr=replace(pair.curr, depth=1.4 * pair.curr.depth))
-    result = refine(wrong)
-    assert result.status.reason is Reason.NO_VALID_DEPTH
-    t = result.T_curr_prev[:3, 3]
-    assert np.sqrt(t @ result.covariance[:3, :3] @ t) / (t @ t) > 0.3
-    # another of the motions found could be the camera's: so could be the distance to it
-    pair, _ = make_pair("one60", 1)
-    found = refine(pair)
-    doubt = Status.degraded(Reason.AMBIGUOUS_MOTION, "two motions")
-    wide = judge(Question(pair, found.replace(status=doubt, probability=0.4)))
-    for other in found.hypotheses[1:]:
-        delta = se3_log(other.T_curr_prev @ invert(wide.T_curr_prev))
-        assert delta @ np.linalg.solve(wide.covariance, delta) < 10
 
 
 def test_every_error_has_a_name_and_their_sum_is_the_covariance() -> None:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.run.cli import main
 from hybridvo.solver.depths import compare_depths
-from tests.walks import REFINE, command, write_walk
 
 K = Camera(90, 95, 63.5, 47.5, 96, 128)
 T = se3_exp(np.array([0.02, -0.03, 0.4, 0.01, -0.02, 0.03]))
@@ -65,29 +62,3 @@ def test_another_scale_is_its_ratio_in_spite_of_holes(pair, scale: float) -> Non
         FramePair(prev, replace(curr, depth=depth, mask=mask), flow), T, followers
     )
     assert found.ratio == pytest.approx(scale, rel=2e-3) and not found.status.ok
-
-
-def test_a_run_says_where_the_scale_changes(tmp_path: Path, capsys) -> None:
-    root = tmp_path / "walk"
-    write_walk(root, 6, height=64, width=96)
-    # a world in which depth is measured again and again: the plane along the walk
-    camera = Camera(96, 96, 47.5, 31.5, 64, 96)
-    step = se3_exp(np.array([0.02, 0.01, 0.05, 0.002, 0.003, 0.001]))
-    T_cam_world = np.eye(4)
-    for i in range(6):
-        depth = plane(camera, T_cam_world)
-        flow = ego_flow(depth, step, camera, camera) + np.random.default_rng(
-            i
-        ).normal(0, 0.1, (64, 96, 2))
-        np.save(
-            root / "depth" / f"{i:06d}.npy",
-            ((3 if i >= 4 else 1) * depth).astype(np.float32),
-        )
-        if i < 5:
-            np.save(root / "flow" / f"{i:06d}.npy", flow.astype(np.float32))
-        T_cam_world = step @ T_cam_world
-    (root / "poses.txt").unlink()
-    arguments = command(root, tmp_path / "out", *REFINE[:-1])
-    assert main(arguments) == 0
-    said = capsys.readouterr().err
-    assert "depth is 3 times the previous one's" in said

@@ -13,13 +13,8 @@ import torch
 
 import hybridvo as hvo
 from hybridvo.core import torch_geometry
-from hybridvo.core.options import Options, PhotometricOptions
 from hybridvo.core.results import Reason
-from hybridvo.lab.synthetic.dataset import Mixture
 from hybridvo.lab.synthetic.noise_scenarios import make_pair
-from hybridvo.lab.synthetic.training_scenes import DiverseOptions
-from hybridvo.lab.training.options import PaperTrainingOptions
-from hybridvo.lab.training.paper_task import PaperTask
 from tests import worlds
 
 SIZE = (120, 160)
@@ -157,26 +152,6 @@ def test_the_four_lines_state_the_probability_of_the_method(pairs) -> None:
         assert motion.one(k).evidence == pytest.approx(alone.evidence, abs=1e-3)
 
 
-def test_the_method_refines_on_the_images_too() -> None:
-    pair, T = worlds.world(SIZE, noise=(0.5, 0.005))
-    plain = Options(photometric=PhotometricOptions(mode="off"))
-    by_flow = hvo.estimate(pair, method="pwvo-refine", options=plain)
-    by_images = hvo.estimate(pair, method="pwvo-refine")
-    assert "images" in by_images.terms and "images" not in by_flow.terms
-    errors = [np.abs(found.T_curr_prev - T).max() for found in (by_flow, by_images)]
-    assert errors[1] < errors[0] + 1e-3
-
-
-def test_the_method_weighs_a_prior(pairs) -> None:
-    pair, truth = pairs[0]
-    sigma = np.diag([0.02**2] * 3 + [0.004**2] * 3)
-    prior = hvo.MotionPrior(truth["T_curr_prev"], sigma)
-    plain = hvo.estimate(pair, method="pwvo-refine")
-    told = hvo.estimate(pair, method="pwvo-refine", prior=prior)
-    assert told.evidence != plain.evidence
-    assert np.abs(told.T_curr_prev - truth["T_curr_prev"]).max() < 0.05
-
-
 def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
     """1 / (1 + exp(-w . evidence)) by hand, and not the share of the rival's weight."""
     motion = hvo.estimate(pairs[0][0], method="pwvo-refine")
@@ -189,22 +164,6 @@ def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
     unsure = hvo.refine(batch, seed.T_curr_prev, seed.weights, lead=torch.zeros(1))
     assert float(unsure.probability[0]) < 0.75
     assert unsure.status[0].reason is hvo.Reason.AMBIGUOUS_MOTION
-
-
-def test_a_part_of_a_seed_states_the_same_with_what_it_carries(pairs) -> None:
-    batch = hvo.PairBatch.from_pairs([p for p, _ in pairs])
-    with torch.no_grad():
-        seed = hvo.select(hvo.PWVO.from_pretrained()(batch))
-    whole = hvo.refine(batch, seed.T_curr_prev, seed.weights)
-    last = hvo.PairBatch.from_pairs([pairs[1][0]])
-    T, weights, lead = seed.T_curr_prev[1:], seed.weights[1:], seed.lead[1:]
-    covariance = seed.covariance[1:]
-    part = hvo.refine(last, T, weights, lead=lead, seed_covariance=covariance)
-    assert float(part.probability[0]) == pytest.approx(
-        float(whole.probability[1]), abs=1e-6
-    )
-    # without it nothing is known but how much of the weight follows another motion
-    assert hvo.refine(last, T, weights).evidence is None
 
 
 @pytest.fixture
@@ -237,30 +196,6 @@ def test_kornia_and_pypose_carry_the_method(pairs, calls) -> None:
     found = hvo.refine(batch)
     assert isinstance(found.SE3, pp.LieTensor)
     assert calls["Exp"] == before + 1
-
-
-def test_kornia_and_pypose_carry_the_training(calls) -> None:
-    """A step of the paper's training: the fit, its gradient, the reconstructed flow."""
-    size = {
-        "width": 0.1,
-        "scale_free": True,
-        "input_stride": 2,
-        "head_stride": 2,
-    }
-    options = PaperTrainingOptions(
-        network=size, loss={"flow_uncertainty": False, "depth_uncertainty": False},
-        fit_weight=1.0, batch_size=4, data_size=(64, 128),
-    )  # fmt: skip
-    task = PaperTask(
-        options, Mixture((DiverseOptions(height=64, width=128),), (1.0,))
-    )
-    loss, parts = task.loss(next(task.batches(0, 0)).to("cpu"), 0)
-    loss.backward()
-    assert torch.isfinite(loss) and parts["fit"] > 0
-    # the step that carries the gradient of a fit of six
-    assert calls["Exp"] == 1 and calls["project"] > 7
-    head = task.network.head_uncertainty[-1]
-    assert head.weight.grad[:3].abs().max() > 0
 
 
 def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:

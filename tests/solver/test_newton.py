@@ -122,24 +122,6 @@ def test_the_cost_is_not_higher_at_the_end(seed: int) -> None:
     assert np.isfinite(result.state.T_curr_prev).all()
 
 
-def test_a_step_below_the_tolerance_is_the_last_and_is_not_checked() -> None:
-    cost = Quadratic(np.diag([4.0] * 3 + [0.0] * 5), np.array([0.1] + [0.0] * 7))
-    result = newton(cost, START, 5, 1.0)
-    assert len(cost.costs) == 1
-    assert result.iterations == 0
-    assert result.state.T_curr_prev[0, 3] == pytest.approx(0.1, rel=1e-5)
-    # two standard deviations to a meter
-    assert result.last2 == pytest.approx(0.04, rel=1e-5)
-
-
-def test_the_steps_are_cut_off() -> None:
-    cost = Robust(3)
-    far = State(se3_exp(np.array([3.0, 3.0, 0.0, 0.0, 0.0, 0.0])))
-    result = newton(cost, far, 2, 0.0)
-    assert result.iterations == 2
-    assert result.last2 > 0
-
-
 def scripted(costs: list[float]):
     """A factor whose call k has a cost and a gradient of its own, and the states it was asked."""
     states: list[State] = []
@@ -154,14 +136,6 @@ def scripted(costs: list[float]):
             return Linearization(np.eye(6), g, cost, np.zeros((6, 6)))
 
     return Scripted(), states
-
-
-def test_each_step_is_evaluated_once() -> None:
-    # the second and the third step fail
-    factor, states = scripted([0.0, -1.0, 5.0, 5.0, -2.0])
-    result = newton(factor, START, 4, 1e-6)
-    assert result.iterations == 4
-    assert len(states) == 5
 
 
 def test_a_step_that_fails_is_taken_back_and_the_next_is_shorter() -> None:

@@ -121,21 +121,6 @@ def test_uncertain_pixels_and_disagreeing_patches_hardly_count() -> None:
     assert error_px(pair, plain.fused.T_curr_prev, T) < 0.3
 
 
-def test_three_ways_to_select() -> None:
-    pair, T, weights = moving_third()
-    patches = patches_of(pair, T, weights)
-    best = int(patches.uncertainty_px[0].argmin())
-    torch.testing.assert_close(patches.surest.T_curr_prev, patches.poses[:, best])
-    torch.testing.assert_close(
-        patches.surest.covariance, patches.covariance[:, best]
-    )
-    errors = [
-        error_px(pair, found.T_curr_prev, T)
-        for found in (patches.fused, patches.surest, patches.patch_mean)
-    ]
-    assert errors[0] < errors[1] and errors[0] < errors[2]
-
-
 def test_a_pair_of_a_batch_is_as_alone_and_one_without_data_stays() -> None:
     pair, T = static_world()
     blind = replace(pair, flow=np.full_like(pair.flow, np.nan))

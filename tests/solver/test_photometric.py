@@ -12,7 +12,6 @@ from hybridvo.core.geometry import backproject, ego_flow_error, invert, se3_exp
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Status
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.flow.frame_images import blurred
 from hybridvo.flow.providers import dis_flow
 from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
@@ -68,34 +67,6 @@ def rows_at(factor, T):
     noisy = factor.under(factor.first(T))
     noisy.linearize(State(T))
     return noisy.rows
-
-
-def test_jacobian_is_that_of_the_residual(light):
-    # at the identity, on one image, the slope of cubic reading is the central difference
-    frame = light[0].prev
-    image = blurred(frame)
-    rng = np.random.default_rng(0)
-    index = np.stack(
-        [rng.integers(8, n - 8, 400) for n in image.shape], axis=1
-    ).astype(np.int32)
-    index = index[np.isfinite(frame.depth[tuple(index.T)])]
-    weights = np.ones(image.shape, np.float32)
-    pair = FramePair(frame, frame, None)
-    factor = ImageFactor(pair, weights, index, RefineOptions())
-
-    def linearized(T):
-        rows = rows_at(factor, T)
-        return rows[ImageRow.MOTION : ImageRow.GAIN], rows[ImageRow.RESIDUAL]
-
-    J, _ = linearized(np.eye(4))
-    for column in range(6):
-        step = np.zeros(6)
-        step[column] = 1e-4
-        _, ahead = linearized(se3_exp(step))
-        _, behind = linearized(se3_exp(-step))
-        slope = (ahead - behind) / 2e-4
-        # the curvature of cubic reading jumps at the pixels, and float32: 2 % of the largest slope
-        assert np.nanmax(np.abs(slope - J[column])) < 0.02 * np.abs(J[column]).max()
 
 
 def test_jacobian_holds_away_from_the_identity_and_between_two_cameras():
@@ -212,29 +183,17 @@ def test_exposure_does_not_matter(light):
     )
 
 
-OTHER = {
-    "black": (
-        lambda rgb: np.zeros_like(rgb),
-        lambda rgb: np.zeros_like(rgb),
-        "texture",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", OTHER)
-def test_useless_images_change_nothing_and_are_named(name, light):
+def test_useless_images_change_nothing_and_are_named(light):
     pair, motion, _ = light
     # what is said of the images stands behind a doubt
     motion = motion.replace(status=Status())
-    first, second, reason = OTHER[name]
-    prev = (
-        pair.prev if first is None else replace(pair.prev, rgb=first(pair.prev.rgb))
+    prev, curr = (
+        replace(frame, rgb=np.zeros_like(frame.rgb))
+        for frame in (pair.prev, pair.curr)
     )
-    bad = replace(
-        pair, prev=prev, curr=replace(pair.curr, rgb=second(pair.curr.rgb))
-    )
+    bad = replace(pair, prev=prev, curr=curr)
     done = refine_photometric(bad, motion)
-    assert reason in done.photometric.refusal
+    assert "texture" in done.photometric.refusal
     assert "images not used" in done.status.message
     assert done.status.state is motion.status.state
     np.testing.assert_array_equal(done.T_curr_prev, motion.T_curr_prev)

@@ -19,7 +19,6 @@ from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 
 CAMERA = Camera(350.0, 340.0, 159.0, 82.0, 160, 320)
-CHI2_6_3SIGMA = 20.06  # 0.9973 quantile of chi-square with 6 degrees of freedom
 
 
 def scene(seed: int, camera: Camera = CAMERA) -> np.ndarray:
@@ -222,17 +221,6 @@ def test_variance_maps_are_used():
 # --- several motions ----------------------------------------------------------------------------
 
 
-def test_one_large_mover_leaves_the_world_among_the_hypotheses():
-    for seed in range(4):
-        pair, truth = make_pair("one60", seed)
-        result = refine(pair)
-        gaps = [
-            errors(h.T_curr_prev, truth["T_curr_prev"]) for h in result.hypotheses
-        ]
-        assert min(r + t / 10 for r, t in gaps) < 2e-3
-        assert all(np.isfinite(h.inliers).all() for h in result.hypotheses)
-
-
 def test_weights_switch_pixels_off():
     pair, truth = make_pair("one60", 1)
     result = refine(pair, weights=(~truth["moving"]).astype(np.float32))
@@ -241,21 +229,6 @@ def test_weights_switch_pixels_off():
     assert refine(pair, weights=broken).T_curr_prev == pytest.approx(
         result.T_curr_prev, abs=1e-12
     )
-
-
-def test_all_pixels_moving_is_never_a_confident_wrong_motion():
-    # every pixel has its own motion: no coherent world
-    wrong = 0
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        depth = scene(seed)
-        flow = rng.uniform(-30, 30, (*CAMERA.shape, 2))
-        result = refine(make(depth, np.eye(4), flow=flow))
-        worlds.assert_sane(result)
-        error = se3_log(result.T_curr_prev)
-        inside = error @ np.linalg.solve(result.covariance, error) < CHI2_6_3SIGMA
-        wrong += result.status.state is State.OK and not inside
-    assert wrong == 0
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, -1.0, 1e38])

@@ -7,18 +7,14 @@ import pytest
 import torch
 
 from hybridvo.core.geometry import invert, se3_exp, se3_log
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, StageFailed
 from hybridvo.core.torch_geometry import se3
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.solver import kernels, robust_fit
-from hybridvo.solver.newton import State
 from hybridvo.solver.noise_estimation import (
     Noise,
     estimate_noise,
 )
-from hybridvo.solver.pixels import PixelGrid, coarse_grid
-from hybridvo.solver.refine_flow import FlowFactor
+from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.torch.factors import ResidualModel, gather_pixels, weigh
 
 CAMERA = Camera(300.0, 290.0, 79.5, 59.5, 120, 160)
@@ -121,15 +117,6 @@ def test_noise_of_depth_shows_where_there_is_parallax() -> None:
         assert found.noise.log_depth == pytest.approx(log_depth, abs=0.012)
 
 
-def test_too_few_pixels_keep_the_noise_they_start_from() -> None:
-    grid = PixelGrid(noisy_pair(2), None)
-    start = Noise(0.5, 0.01)
-    pose = se3_exp(XI)[:3].copy()
-    found = estimate_noise(grid.samples, 5, pose, grid.K, start, start, 5, 100)
-    assert found.noise == start
-    assert found.inlier_ratio == 0
-
-
 # --- all pixels -----------------------------------------------------------------------
 
 
@@ -156,35 +143,4 @@ def test_curvature_and_meat_are_those_of_torch() -> None:
         )
 
 
-def test_a_linearization_does_not_change_with_the_next() -> None:
-    grid = PixelGrid(noisy_pair(6), None)
-    noise = kernels.residual_noise(0.3, 0.01, 3.0)
-    scores = kernels.ScoreProducts(np.zeros(21), np.zeros(21))
-    factor = FlowFactor(grid, noise, 24, scores)
-    first = factor.linearize(State(se3_exp(XI)))
-    kept = first.weights.copy()
-    second = factor.linearize(State(np.eye(4)))
-    assert (first.weights == kept).all()
-    assert (second.weights != kept).any()
-
-
 # --- what cannot be refined -------------------------------------------------------------
-
-
-def test_a_pair_that_lacks_something_fails_as_a_stage() -> None:
-    pair = noisy_pair(7)
-    options = RefineOptions()
-    assert coarse_grid(pair, None, options).count > 0
-    no_flow = FramePair(pair.prev, pair.curr, None)
-    no_depth = FramePair(Frame(None, None, CAMERA), pair.curr, pair.flow)
-    invalid = np.full(CAMERA.shape, np.nan, np.float32)
-    all_invalid = FramePair(Frame(None, invalid, CAMERA), pair.curr, pair.flow)
-    for broken, weights, reason in (
-        (no_flow, None, Reason.NO_FLOW),
-        (no_depth, None, Reason.NO_VALID_DEPTH),
-        (all_invalid, None, Reason.NO_VALID_DEPTH),
-        (pair, np.zeros(CAMERA.shape, np.float32), Reason.LOW_INLIERS),
-    ):
-        with pytest.raises(StageFailed) as failure:
-            coarse_grid(broken, weights, options)
-        assert failure.value.reason is reason

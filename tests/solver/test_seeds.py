@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-import hybridvo
-from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow, ego_flow_error, se3_exp
 from hybridvo.core.torch_geometry import se3
 from hybridvo.core.types import FramePair, PairBatch
@@ -104,15 +102,3 @@ def test_a_displacement_is_that_of_perturbed_poses() -> None:
         change = ego_flow(pair.prev.depth, moved, *cameras) - pair.flow
         squares.append(np.mean(np.sum(change**2, axis=2)))
     assert stated == pytest.approx(np.sqrt(np.mean(squares)), rel=0.1)
-
-
-@pytest.mark.parametrize(
-    "value",
-    ["x", torch.eye(6), torch.full((1, 6, 6), np.nan), -torch.eye(6)[None]],
-    ids=["text", "one matrix", "no numbers", "negative"],
-)
-def test_what_is_no_covariance_is_refused(value: object) -> None:
-    batch, pair, T, _ = with_large_object()
-    start = torch.from_numpy(T)[None]
-    with pytest.raises(InputError, match="seed_covariance"):
-        hybridvo.refine(batch, start, uneven_weights(pair), seed_covariance=value)

@@ -20,12 +20,6 @@ PARTS = parts_of_tiles(8, 8)
 """Of a view of 8 x 8 tiles."""
 
 
-def test_tiles_lie_in_quadrants_and_in_bands():
-    quadrants, bands = PARTS.reshape(2, 8, 8)
-    np.testing.assert_array_equal(quadrants[3:5, 3:5], [[0, 1], [2, 3]])
-    np.testing.assert_array_equal(bands[:, 0], [0, 0, 1, 1, 2, 2, 3, 3])
-
-
 def test_the_covariance_of_errors_of_parts_is_that_of_drawn_ones():
     """The mean over both ways to cut the view, each checked by drawing the parts' errors."""
     rng = np.random.default_rng(3)
@@ -42,12 +36,6 @@ def test_the_covariance_of_errors_of_parts_is_that_of_drawn_ones():
     expected = np.mean(drawn, axis=0)
     # 40 000 draws: each entry to about 1 % of the largest
     np.testing.assert_allclose(stated, expected, atol=0.04 * np.abs(expected).max())
-
-
-def test_an_error_of_a_part_is_larger_than_that_of_its_tiles_apart():
-    alike = np.ones((64, 1, 6))
-    apart = 64.0
-    assert shared_covariance(alike, PARTS)[0, 0] > 4 * apart
 
 
 STILL = Scenario(moving=0.0, outliers=0.0, depth_noise=0.0, flow_noise_px=0.0)
@@ -120,12 +108,3 @@ def test_a_pull_is_what_an_error_does_to_the_score(kind):
     scale = np.abs(pulls).max(axis=(0, 1))
     # the robust weights fall by 2 d^2 / c^2: 0.2 %; single precision
     np.testing.assert_allclose(scores / part / scale, pulls / scale, atol=0.02)
-
-
-def test_a_view_without_pixels_is_taken_as_coherent():
-    grid, pose = still_grid()
-    grid.weight[:] = 0
-    noise = kernels.residual_noise(0.1, 0.001, 3.0)
-    rows, columns, _ = grid.shape
-    found = coherent_fraction(grid.samples, rows, columns, pose, grid.K, noise)
-    assert found == 1.0

@@ -221,13 +221,3 @@ def test_unusable_values_leave_no_trace_in_gradients() -> None:
         gradients = torch.autograd.grad(total_score(pixels, T, how).sum(), inputs)
         assert all(torch.isfinite(gradient).all() for gradient in gradients)
         assert gradients[1][0, 0, 0] == 0
-
-
-def test_subset_takes_usable_pixels_once() -> None:
-    batch, _ = noisy_batch(size=(40, 50))
-    valid = torch.zeros(2, 40, 50, dtype=torch.bool)
-    valid[0, 10:30, 10:40] = True
-    valid[1, 5, 5:12] = True
-    few = gather_pixels(replace(batch, valid=valid)).subset(200)
-    assert (few.weight > 0).sum(dim=1).tolist() == [200, 7]
-    assert len(torch.unique(few.points[0].T, dim=0)) == 200

@@ -67,16 +67,6 @@ def test_forward_mode_is_refused_instead_of_losing_the_tangent() -> None:
             of_flow(flow)
 
 
-def test_a_batch_is_refused_inside_of_a_transform_of_something_else() -> None:
-    """There even tensors made of plain ones are wrapped."""
-
-    def loss(x: torch.Tensor) -> torch.Tensor:
-        return (x * of_flow(BATCH.flow)).sum()
-
-    with pytest.raises(hvo.InputError, match=r"torch\.func"):
-        torch.func.grad(loss)(torch.ones(()))
-
-
 @pytest.mark.parametrize("vectorize", [False, True])
 def test_what_the_message_names_works(vectorize: bool) -> None:
     push = torch.zeros(2, dtype=torch.float64)

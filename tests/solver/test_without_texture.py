@@ -9,10 +9,8 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
-from hybridvo.core.options import RefineOptions
 from hybridvo.flow.providers import has_texture
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.solver.planes import PlaneFactor
 from tests import worlds
 
 SIZE = (240, 320)
@@ -83,36 +81,3 @@ def test_depth_alone_shows_the_motion_where_images_are_too_dark():
     # the motion is 11 cm; 99.9 % of 6 degrees of freedom lie within 22.5
     assert np.linalg.norm(error[:3]) < 0.005
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
-
-
-def informations(depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information (6, 6) by structure, and as stated, of a standing camera's equal maps."""
-    frame = hvo.Frame(None, depths.astype(np.float32), CAMERA)
-    pair = hvo.FramePair(frame, frame, None)
-    planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 0.5, RefineOptions())
-    at = planes.at(np.eye(4))
-    assert at.determine_motion
-    return planes.structure(at).common, at.information
-
-
-def test_the_noise_of_a_wall_is_no_structure():
-    """It shows its distance and two tilts, as a plane does, and nothing else."""
-    rng = np.random.default_rng(6)
-    by_structure, all_of_it = informations(2 + 0.002 * rng.standard_normal(SIZE))
-    found = np.diag(by_structure)
-    stated = np.diag(all_of_it)
-    along = [0, 1, 5]
-    across = [2, 3, 4]
-    # the mean of 5000 products of independent numbers is 0 to within 0.014 of their size
-    assert (found[along] < 0.05 * stated[along]).all()
-    # what is stated has a part by noise here as well
-    assert (found[across] > 0.5 * stated[across]).all()
-
-
-def test_waves_of_a_surface_are_structure():
-    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
-    waves = 2 + 0.05 * np.sin(u / 20) * np.cos(v / 20)
-    by_structure, all_of_it = informations(waves)
-    found = np.linalg.eigvalsh(by_structure)
-    stated = np.linalg.eigvalsh(all_of_it)
-    assert found[0] > 0.5 * stated[0]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,15 +14,10 @@ from scipy.spatial.transform import Rotation
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, make_transform
 from hybridvo.core.results import RelativePose
-from hybridvo.io.data.open import open_sequence
 from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.run.cli import main
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.tracking.accelerometer import Accelerometer
-from hybridvo.tracking.odometry import _accelerometer_after
-from tests import captures
-from tests.io.data.test_stereo import euroc_folder
 
 RATE_HZ = 200
 FRAME_S = 1 / 30
@@ -78,14 +71,6 @@ def test_a_level_camera_at_rest_reads_upwards() -> None:
     np.testing.assert_allclose(along, [1, 0, 0], atol=1e-12)
     # nothing is said of a change along the direction
     np.testing.assert_allclose(found.covariance @ found.direction, 0, atol=1e-15)
-
-
-def test_a_camera_that_looks_30_degrees_down() -> None:
-    up = np.array([0, -np.sqrt(3) / 2, -0.5])
-    found = after(readings(0, G * up), step_at(FRAME_S))
-    np.testing.assert_allclose(found.direction, -up, atol=1e-12)
-    along = found.T_gravity_world[:3, :3] @ [0, 0, 1]
-    np.testing.assert_allclose(along, [np.sqrt(3) / 2, 0, -0.5], atol=1e-12)
 
 
 def test_a_camera_that_was_level_once_and_looks_down_now() -> None:
@@ -176,18 +161,6 @@ def test_it_is_as_near_as_it_says(seed: int, shake: float) -> None:
         assert np.linalg.eigvalsh(found.covariance)[0] > -1e-12
 
 
-def test_time_makes_it_surer_and_shaking_less_sure() -> None:
-    stds = {
-        (seconds, shake): walked(seconds, 1, shake)[0].gravity().std
-        for seconds in (1.0, 5.0)
-        for shake in (0.1, 2.0)
-    }
-    assert stds[5.0, 0.1] < stds[1.0, 0.1] < stds[1.0, 2.0]
-    assert stds[5.0, 2.0] < 0.7 * stds[1.0, 2.0]
-    # what the sensor is off by is not averaged away while the camera looks one way
-    assert stds[5.0, 0.1] > 0.3 / G
-
-
 def test_turning_averages_the_bias_of_the_sensor_away() -> None:
     """A camera on its tripod, and one that was laid on its other side for as long."""
     bias = np.array([0.4, 0, 0])
@@ -207,12 +180,6 @@ def test_turning_averages_the_bias_of_the_sensor_away() -> None:
     after_turn = np.diag(found[59].covariance)
     assert after_turn[0] < 0.5 * before[0]
     assert after_turn[2] > 0.5 * before[2]
-
-
-def test_strong_shaking_does_not_stick_to_what_came_first() -> None:
-    """What speeds a camera up slows it down again: the mean of all is near."""
-    known, down = walked(5.0, 3, 2.0)
-    assert degrees(known.gravity().direction, down) < 2.0
 
 
 def test_a_knock_makes_it_less_sure() -> None:
@@ -334,22 +301,6 @@ def test_motions_are_the_same_with_and_without_it() -> None:
         assert step.status == other.status
 
 
-def test_a_piece_of_path_on_its_own_has_its_own_gravity() -> None:
-    frames, samples, _ = recording(2)
-    tracker = hvo.Odometry(network=None)
-    for frame, imu in zip(frames, samples, strict=True):
-        step = tracker.track(frame, imu=imu)
-    before = tracker.state
-    assert before.accelerometer is not None
-    # a path that was lost goes on at an unknown place
-    after = dataclasses.replace(before, part=before.count)
-    known = _accelerometer_after(before.gyroscope, before, after, step)
-    assert known is not None and known.gravity() is None
-    # what is known of the hand stays, and no sample counts twice
-    assert known.variance == before.accelerometer.variance
-    assert known.stamp == before.accelerometer.stamp
-
-
 def test_a_pose_that_is_not_known_says_little() -> None:
     """Of a motion that failed; the world goes on from the frame before."""
     known, _ = walked(1.0, 5, 0.1)
@@ -369,37 +320,3 @@ def test_it_costs_constant_memory_and_comes_back_from_disk() -> None:
     back = restored(json.loads(text), None)  # type: ignore[arg-type]
     for name, value in vars(known).items():
         np.testing.assert_array_equal(getattr(back, name), value)
-
-
-@pytest.mark.slow
-def test_a_run_states_gravity_and_resumes_to_the_last_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = captures.with_imu(euroc_folder(tmp_path / "seq"))
-    whole = tmp_path / "whole"
-    cut = tmp_path / "cut"
-    options = ["--method", "classical", "-q", "--max-failed", "1"]
-    track = hvo.Odometry.track
-
-    def leave_a_copy(
-        self: hvo.Odometry, frame: hvo.Frame, **more: object
-    ) -> hvo.Step:
-        # what a run leaves that is killed before its last frame
-        if self.state.count == 2:
-            shutil.copytree(whole, cut)
-        return track(self, frame, **more)  # type: ignore[arg-type]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(hvo.Odometry, "track", leave_a_copy)
-        assert main(["run", str(root), "--out", str(whole), *options]) == 0
-    summary = json.loads((whole / "run.json").read_text())["summary"]
-    sequence = open_sequence(root)
-    assert sequence.R_cam_imu is not None
-    # the body's z is up
-    down = sequence.R_cam_imu @ [0, 0, -1]
-    np.testing.assert_allclose(summary["gravity"]["direction"], down, atol=0.02)
-    assert 0 < summary["gravity"]["sigma_deg"] < 20
-
-    assert main(["run", str(root), "--out", str(cut), *options, "--resume"]) == 0
-    again = json.loads((cut / "run.json").read_text())["summary"]
-    assert again["gravity"] == summary["gravity"]

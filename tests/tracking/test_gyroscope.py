@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.io.data.open import open_sequence
 from hybridvo.lab.synthetic.render import SyntheticSequence
 from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.run.cli import main
 from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking import odometry
 from hybridvo.tracking.gyroscope import Gyroscope
@@ -251,14 +249,6 @@ def test_samples_of_a_phone_come_out_of_the_child(tmp_path: Path) -> None:
     sequence = open_sequence(root)
     assert "1 of 31 rows of imu.csv are left out" in " ".join(sequence.warnings)
     assert sequence.imu_samples is not None and len(sequence.imu_samples) == 30
-
-
-def test_a_run_hands_the_samples_on(tmp_path: Path) -> None:
-    root = captures.with_imu(euroc_folder(tmp_path / "seq"))
-    out = tmp_path / "out"
-    assert main(["run", str(root), "--out", str(out), "-q"]) in (0, 3)
-    with (out / "steps.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 3
 
 
 @pytest.mark.parametrize("is_fixed", [True, False])

@@ -10,7 +10,6 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core.geometry import (
     adjoint,
-    ego_flow,
     invert,
     mean_flow,
     se3_exp,
@@ -20,17 +19,13 @@ from hybridvo.core.results import MotionPrior, Reason, RelativePose
 from hybridvo.tracking.calibration import (
     KEYFRAME_AGE,
     KEYFRAME_CORRELATION,
-    KEYFRAME_FLOW,
     MIN_DEPTH_SHARE,
 )
 from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,
-    carried_weights,
     expected_motion,
     has_enough_depth,
-    is_near,
-    trimmed,
 )
 from tests import slow_walk
 
@@ -86,27 +81,6 @@ def test_adjoint_moves_a_perturbation_through_a_motion() -> None:
     np.testing.assert_allclose(moved, adjoint(T) @ delta, atol=1e-12)
 
 
-def test_a_keyframe_stays_until_it_is_too_far_or_too_old() -> None:
-    limit = KEYFRAME_FLOW * 64 * 2.0 / 100  # metres to the side
-    key = keyframe(0.0, count=0)
-    assert is_near(key, se3_exp(0.99 * limit * SIDEWAYS), KEYFRAME_AGE)
-    assert not is_near(key, se3_exp(1.01 * limit * SIDEWAYS), 1)
-    assert not is_near(key, np.eye(4), KEYFRAME_AGE + 1)
-
-
-def test_a_keyframe_hands_over_to_one_half_as_far() -> None:
-    step = 0.1 * KEYFRAME_FLOW * 64 * 2.0 / 100
-    ring = tuple(keyframe(k * step, count=k) for k in range(11))
-    near = trimmed(ring, se3_exp(9.5 * step * SIDEWAYS), 11)
-    assert near == ring
-    far = trimmed(ring, se3_exp(11.0 * step * SIDEWAYS), 11)
-    # the oldest within half of the limit, five steps with rounding: four
-    assert far[0].count == 7 and far == ring[7:]
-    lost = trimmed(ring, se3_exp(100.0 * step * SIDEWAYS), 11)
-    assert lost == ring[-1:]
-    assert trimmed((), np.eye(4), 3) == ()
-
-
 def test_a_prior_of_the_next_step_becomes_one_from_the_keyframe() -> None:
     T_prev_key = se3_exp(np.array([0.1, 0, 0, 0, 0.1, 0]))
     step = se3_exp(np.array([0.02, 0, 0.01, 0, 0.02, 0]))
@@ -139,21 +113,6 @@ def test_the_motion_between_neighbours_and_its_covariance() -> None:
         draws.append(se3_log(drawn @ invert(step)))
     ratio = np.cov(np.array(draws).T) / (expected / (1 - KEYFRAME_CORRELATION))
     np.testing.assert_allclose(np.diag(ratio), 1, atol=0.12)  # 4000 draws: 5 sigma
-
-
-def test_weights_are_carried_to_where_the_points_are_seen() -> None:
-    key = frame()
-    weights = np.zeros((48, 64), np.float32)
-    weights[:, 30:] = 1.0
-    # the later frame stands 8 cm to the right: its pixels show what stood 4 px further right
-    carried = carried_weights(weights, key, frame(), se3_exp(0.08 * SIDEWAYS))
-    assert carried[24, 20] == 0 and carried[24, 34] == 1
-    flow = ego_flow(key.depth, se3_exp(-0.08 * SIDEWAYS), CAMERA, CAMERA)
-    assert flow[24, 32, 0] == pytest.approx(-4.0)
-    # beyond the keyframe's border nothing is known
-    assert carried[24, 63] == 0
-    blind = replace(frame(), depth=np.zeros((48, 64), np.float32))
-    assert not carried_weights(weights, key, blind, np.eye(4)).any()
 
 
 @pytest.mark.slow

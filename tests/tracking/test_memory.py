@@ -21,7 +21,6 @@ from hybridvo.core.types import FramePair
 from hybridvo.hypotheses.direct import direct_start
 from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.run.commands.run import restored, saved
-from hybridvo.solver.planes import PlaneFactor
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,
@@ -135,14 +134,6 @@ def test_a_belief_without_evidence_dies(
         memory = faded(memory)
     assert np.abs(memory.belief.log_odds).max() < 0.01
     assert not memory.belief.is_ready
-
-
-def test_its_points_are_those_of_the_depth_maps() -> None:
-    pair = FramePair(view(), view(), None)
-    planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 1.0, Options().refine)
-    index = grid_index(SIZE)
-    np.testing.assert_array_equal(planes.index, index[planes.cells])
-    assert planes.on_grid(np.ones(len(planes.index))).shape == index.shape[:2]
 
 
 def test_how_far_a_point_lies_behind_what_is_measured() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import gc
 import tracemalloc
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.providers import FlowField, dis_flow
 from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.tracking.odometry import Odometry, warm_up
+from hybridvo.tracking.odometry import Odometry
 
 HEIGHT, WIDTH = 48, 64
 CAMERA = Camera(60, 60, 31.5, 23.5, HEIGHT, WIDTH)
@@ -103,14 +102,6 @@ def test_set_pose_before_and_during_the_walk() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    "T", [np.zeros((4, 4)), np.full((4, 4), np.nan), np.eye(3)]
-)
-def test_set_pose_refuses_what_is_no_pose(T: np.ndarray) -> None:
-    with pytest.raises(InputError, match="set_pose"):
-        tracker().set_pose(T)
-
-
 @pytest.mark.parametrize("policy", ["hold", "constant_velocity"])
 def test_failed_motion_follows_the_policy(policy: str) -> None:
     vo = tracker(on_failure=policy)
@@ -143,15 +134,6 @@ def test_a_frame_that_cannot_be_read_is_spanned() -> None:
     )
 
 
-def test_a_step_names_the_frame_that_its_motion_starts_from() -> None:
-    odometry = tracker()
-    steps = [odometry.track(frame(0)), odometry.skip(1, 0.1)]
-    steps += [odometry.track(frame(k)) for k in (2, 3)]
-    assert [step.prev_index for step in steps] == [None, 0, 0, 2]
-    expected = np.linalg.matrix_power(MOTION, 2)
-    np.testing.assert_allclose(steps[2].T_curr_prev, expected, atol=1e-4)
-
-
 def test_frames_lost_under_constant_velocity_move_on_and_come_back() -> None:
     vo = tracker(on_failure="constant_velocity")
     vo.track(frame(0))
@@ -162,29 +144,6 @@ def test_frames_lost_under_constant_velocity_move_on_and_come_back() -> None:
         np.testing.assert_allclose(step.T_world_cam, expected, atol=1e-4)
     expected = invert(np.linalg.matrix_power(MOTION, 4))
     np.testing.assert_allclose(vo.track(frame(4)).T_world_cam, expected, atol=1e-4)
-
-
-def test_a_first_frame_that_cannot_be_read() -> None:
-    vo = tracker()
-    assert not vo.skip(0, 0.0).ok
-    assert vo.track(frame(1)).ok
-    np.testing.assert_allclose(
-        vo.track(frame(2)).T_world_cam, invert(MOTION), atol=1e-5
-    )
-
-
-def test_a_frame_without_image_is_spanned_where_flow_needs_images() -> None:
-    def with_images(prev: Frame, curr: Frame) -> FlowField:
-        if prev.rgb is None or curr.rgb is None:
-            return FlowField(None)
-        return exact_flow()(prev, curr)
-
-    vo = tracker(flow=with_images)
-    vo.track(frame(0))
-    blind = vo.track(frame(1, rgb=None))
-    assert blind.status.reason is Reason.NO_FLOW
-    expected = invert(np.linalg.matrix_power(MOTION, 2))
-    np.testing.assert_allclose(vo.track(frame(2)).T_world_cam, expected, atol=1e-5)
 
 
 def test_flow_can_be_handed_in() -> None:
@@ -235,21 +194,6 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
     assert vo.track(frame(1)).ok
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"network": object()}, "Odometry.network: expected str, got object"),
-        ({"flow": 3}, "expected a callable"),
-        ({"method": "clasical"}, "did you mean 'classical'"),
-        ({"method": "hybrid", "network": None}, "needs a network"),
-        ({"options": {"track": 3}}, "expected Options, got dict"),
-    ],
-)
-def test_wrong_options(options: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        Odometry(**options)
-
-
 def test_a_frame_without_depth_is_spanned() -> None:
     vo = tracker()
     for i in range(3):
@@ -264,13 +208,6 @@ def test_a_frame_without_depth_is_spanned() -> None:
     np.testing.assert_allclose(
         vo.track(frame(5)).T_world_cam, invert(MOTION), atol=1e-4
     )
-
-
-def test_the_first_frame_with_depth_is_the_first_that_leads() -> None:
-    vo = tracker()
-    vo.track(frame(0, depth=None))
-    assert vo.track(frame(1)).status.reason is Reason.NO_VALID_DEPTH
-    assert vo.track(frame(2)).ok
 
 
 def test_a_frame_that_shows_something_else_is_spanned() -> None:
@@ -383,34 +320,6 @@ def test_memory_is_constant_over_200_frames() -> None:
     # one frame is 21 kB: keeping even one in ten would be 380 kB; interpreter and numpy caches fill
     # up to 100 kB and stay there (measured over 800 frames)
     assert grown < 200_000
-
-
-def test_two_trackers_in_two_threads_give_the_poses_of_one_after_the_other() -> (
-    None
-):
-    rng = np.random.default_rng(1)
-    pictures = [
-        rng.integers(0, 255, (120, 160, 3), dtype=np.uint8) for _ in range(2)
-    ]
-    camera = Camera(120, 120, 79.5, 59.5, 120, 160)
-
-    def walk(seed: int) -> np.ndarray:
-        vo = Odometry(flow=dis_flow("fast"))
-        poses = []
-        for i in range(5):
-            rgb = np.roll(pictures[seed], i, axis=1)
-            plane = np.full((120, 160), 3.0 + seed, np.float32)
-            poses.append(
-                vo.track(Frame(rgb, plane, camera, 0.1 * i, i)).T_world_cam
-            )
-        return np.stack(poses)
-
-    warm_up()
-    serial = [walk(0), walk(1)]
-    with ThreadPoolExecutor(2) as pool:
-        np.testing.assert_allclose(
-            list(pool.map(walk, (0, 1))), serial, rtol=0, atol=1e-6
-        )
 
 
 def test_frames_without_an_index_are_counted() -> None:

@@ -99,29 +99,14 @@ test_refuses = refuses(
         )
         for name, call, words in (
             (
-                "a generator",
-                lambda: track_in_passes(blank(k) for k in range(3)),  # type: ignore[arg-type]
-                ("got generator", "pass list(frames)"),
-            ),
-            (
                 "a frame",
                 lambda: track_in_passes(blank(0)),  # type: ignore[arg-type]
                 ("a list of frames", "got Frame"),
             ),
             (
-                "no frames",
-                lambda: track_in_passes(["a.png"]),  # type: ignore[list-item]
-                ("frame 0", "expected Frame", "got str"),
-            ),
-            (
                 "one index twice",
                 lambda: track_in_passes([blank(4), blank(4)]),
                 ("frame 1", "an index of its own", "got 4"),
-            ),
-            (
-                "a tracker",
-                lambda: track_in_passes([blank(0)], 2, hvo.Odometry()),  # type: ignore[arg-type]
-                ("make_tracker", "got Odometry"),
             ),
             (
                 "one tracker for all passes",
@@ -202,16 +187,6 @@ def test_what_a_camera_hands_out_again_stays_as_it_is() -> None:
     np.testing.assert_allclose(turn, motion[3:] / PERIOD_S, atol=0.05)
     late = [blank(0, 20.0), blank(1, 20.0, stamp=5.0)]
     assert not times_of(late, [step_to(0, 0.0), step_to(1, 0.1)]).velocities
-
-
-def test_a_failure_that_no_motion_spans_parts_the_path() -> None:
-    frames = [blank(k, readout_ms=20.0) for k in range(4)]
-    steps = [step_to(k, 0.01 * k, failed=k == 1) for k in range(4)]
-    velocities = times_of(frames, steps).velocities
-    assert 0 not in velocities
-    # known from where it went on
-    assert velocities.keys() == {1, 2, 3}
-    assert velocities[2][0] == pytest.approx(-0.01 / PERIOD_S)
 
 
 def test_frames_of_one_time_learn_nothing() -> None:

@@ -128,53 +128,6 @@ def test_places_of_another_scene_are_not_taken_for_this_one(frames):
     assert not motion.ok
 
 
-def test_the_search_from_a_place_keeps_to_the_budget(frames, monkeypatch):
-    options = hvo.Options()
-    options = replace(options, track=replace(options.track, budget_ms=1000.0))
-    vo = hvo.Odometry(network=None, options=options)
-    vo.track(frames[0])
-    state = replace(vo.state, keyframes=(), frame=frames[1], is_sure=False, count=2)
-    vo.resume(state)
-    asked = []
-
-    def record(pairs, method, context, deadline=None, confirm=None):
-        asked.append((pairs[0].pair.prev.index, deadline))
-        nothing = hvo.RelativePose.failed(hvo.Reason.NO_FLOW, "")
-        return pipeline.Answer(0, nothing)
-
-    monkeypatch.setattr("hybridvo.pipeline.first_sure", record)
-    vo.track(frames[2])
-    starts = [start for start, _ in asked]
-    assert starts == [None, 0]
-    assert asked[0][1] is not None
-    assert asked[1][1] == asked[0][1]
-
-
-@pytest.mark.parametrize(("is_usable", "sources"), [(True, 1), (False, 3)])
-def test_a_frame_that_has_a_motion_asks_a_place_by_one_source(
-    frames, monkeypatch, is_usable, sources
-):
-    """Without any motion a place is all that is left, and is asked by every source."""
-    asked = []
-    doubtful = hvo.Status.degraded(hvo.Reason.AMBIGUOUS_MOTION, "by hand")
-    motion = hvo.RelativePose(status=doubtful, probability=0.5)
-    if not is_usable:
-        motion = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "by hand")
-
-    def three_sources(evidence, ctx):
-        for _ in range(3):
-            asked.append(evidence.pair.prev.index)
-            yield pipeline.Found(motion, evidence.pair)
-
-    vo = hvo.Odometry(network=None)
-    vo.track(frames[0])
-    monkeypatch.setitem(pipeline.METHODS, vo.method, three_sources)
-    state = replace(vo.state, keyframes=(), frame=frames[1], is_sure=False, count=2)
-    vo.resume(state)
-    vo.track(frames[2])
-    assert asked.count(0) == sources
-
-
 def test_a_place_has_depth(frames):
     """Where flow is given, a motion may lead to a frame without depth."""
     vo = hvo.Odometry(network=None)
@@ -184,12 +137,6 @@ def test_a_place_has_depth(frames):
     assert vo.track(blind, flow=flow(frames[0], blind)).ok
     assert [place.count for place in vo.state.places] == [0]
     assert [keyframe.count for keyframe in vo.state.keyframes] == []
-
-
-def test_a_prior_of_another_kind_is_refused(frames):
-    vo = hvo.Odometry(network=None)
-    with pytest.raises(hvo.InputError, match="prior"):
-        vo.track(frames[0], prior=np.eye(4))
 
 
 def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
@@ -214,36 +161,6 @@ def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
     tried.clear()
     pipeline.first_sure([ctx.evidence(pair)], "hybrid", ctx)
     assert len(tried) == 5
-
-
-def _asked(monkeypatch, frames, motions):
-    """Which of two pairs was asked in turn, where each source finds a given motion of each."""
-    asked = []
-
-    def scripted(evidence, ctx):
-        number = 0 if evidence.pair.prev is frames[0] else 1
-        for motion in motions[number]:
-            asked.append(number)
-            yield pipeline.Found(motion, evidence.pair)
-
-    monkeypatch.setitem(pipeline.METHODS, "hybrid", scripted)
-    # the motions stand for themselves
-    monkeypatch.setattr(pipeline, "finished", lambda e, found, *_: found.motion)
-    ctx = pipeline.Context()
-    pairs = [
-        ctx.evidence(FramePair(frame, frames[2], None)) for frame in frames[:2]
-    ]
-    pipeline.first_sure(pairs, "hybrid", ctx)
-    return asked
-
-
-def test_costly_sources_are_asked_about_the_surest_pair_alone(frames, monkeypatch):
-    def doubtful(probability):
-        nothing = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "")
-        return nothing.replace(probability=probability)
-
-    motions = (4 * [doubtful(0.2)], 4 * [doubtful(0.6)])
-    assert _asked(monkeypatch, frames, motions) == [0, 1, 0, 1, 1, 1]
 
 
 def test_an_answer_that_is_late_is_not_improved(frames):

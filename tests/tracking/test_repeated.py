@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.core.geometry import invert, se3_exp, se3_log
-from hybridvo.core.results import MotionPrior
-from hybridvo.core.types import FramePair
-from hybridvo.solver.depth_alone import motion_by_depth
+from hybridvo.core.geometry import invert, se3_log
 from hybridvo.tracking.repeated import Repeat, repeat_of
 from tests import slow_walk
 
@@ -111,22 +108,6 @@ def test_noise_in_the_image_alone_is_no_repeated_depth(walk) -> None:
         for _ in range(4)
     ]
     assert all(step.ok for step in tracked(frames, walk[1]))
-
-
-def test_depth_alone_where_it_is_sure(walk) -> None:
-    frames, poses = walk
-    true = invert(poses[1]) @ poses[0]
-    vague = MotionPrior(np.eye(4), 1e-2 * np.eye(6))
-    pair = FramePair(frames[0], frames[1], None)
-    found = motion_by_depth(pair, vague)
-    before = np.linalg.norm(se3_log(true))
-    assert np.linalg.norm(se3_log(found.T_curr_prev @ invert(true))) < 0.3 * before
-    assert np.trace(found.covariance) < 1e-2
-    # a wall tells three of the six: the others stay as expected
-    wall = hvo.Frame(None, np.full((48, 64), 2.0, np.float32), CAMERA)
-    aside = MotionPrior(se3_exp(np.array([0.05, 0, 0, 0, 0, 0])), 1e-4 * np.eye(6))
-    found = motion_by_depth(FramePair(wall, wall, None), aside)
-    assert found.T_curr_prev[0, 3] == pytest.approx(0.05, abs=1e-3)
 
 
 # -- clocks ------------------------------------------------------------------------------
