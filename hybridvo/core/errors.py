@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 # characters; a value that a user hands in may be of any length
 MAX_MESSAGE_LENGTH = 2000
@@ -53,6 +54,17 @@ def did_you_mean(
     # an option of the command line stands for itself
     quoted = name if name.startswith("-") else f"'{name}'"
     return f" (did you mean {quoted}?)"
+
+
+@contextlib.contextmanager
+def format_errors(where: object) -> Iterator[None]:
+    """Turn an InputError about what a file holds into a FormatError that names the file."""
+    try:
+        yield
+    except InputError as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"{where}: {error}") from None
 
 
 def missing_sequence(path: object) -> str:

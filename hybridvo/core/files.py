@@ -297,6 +297,12 @@ def remove(*paths: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def write_lines(path: str | Path, lines: Iterable[str]) -> None:
+    """Write lines of text."""
+    with atomic_write(path) as file:
+        file.writelines(f"{line}\n" for line in lines)
+
+
 def write_json(path: str | Path, value: Any) -> None:
     """Write a value as indented JSON; a ValueError refuses numbers that are not finite."""
     text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

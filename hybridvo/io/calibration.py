@@ -11,13 +11,6 @@ DISPARITY_STD_PX = 0.5
 """Standard deviation of a disparity of semi-global block matching, px. It prefers whole pixels by
 up to 0.3 px, whatever the texture: planes of disparity 10 to 11 in steps of 1/8, as
 ``pytest tests/io/data/test_stereo.py`` renders them. The rest is for occlusion and weak texture."""
-TELLING_WEIGHT = 3.0
-"""How much more a file that only one kind of recordings has says of a folder than one that many
-have, such as ``depth``: ``hybridvo doctor DIR`` names the layout that a folder is taken for."""
-MIN_LAYOUT_LIKENESS = 0.4
-"""Share of a layout, by the weight of its parts, that a folder must have before a refusal names
-that layout: ``color`` and ``depth`` alone, which are .4 of what Open3D's recorder writes, are worth
-a name; one folder ``rgb`` is not (the same command)."""
 MIN_LIVE_COLUMNS = 200
 """Columns below which images are not made smaller, px: ``tools/benchmark.py live`` shows whether
 the path holds at 213."""

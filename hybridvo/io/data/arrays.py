@@ -13,14 +13,19 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from hybridvo.core.checks import as_rigid
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import unpacked_limit
 from hybridvo.core.trajectory import FILE_TOLERANCE, to_seconds
 from hybridvo.core.types import Camera
 from hybridvo.io.data.camera_file import parse_camera
 from hybridvo.io.data.lists import abbreviated, assumed_rate
-from hybridvo.io.data.sequence import undistort
-from hybridvo.io.data.streams import Images, Lens, StreamSequence, units_per_metre
+from hybridvo.io.data.streams import (
+    Images,
+    Lens,
+    StreamSequence,
+    straightened,
+    units_per_metre,
+)
 
 LARGEST_UNPACKED = 2**33
 """Bytes of an array that is unpacked into memory; others stay on the disk."""
@@ -95,10 +100,8 @@ class ArraySequence(StreamSequence):
                 raise InputError(
                     f"{self.root}: there is no array 'K' (3, 3): give --camera fx,fy,cx,cy."
                 )
-            try:
+            with format_errors(f"{self.root}: K"):
                 self._camera = Camera.from_matrix(np.array(K), *size)
-            except InputError as error:
-                raise FormatError(f"{self.root}: K: {error}") from None
         if self._camera.shape != size:
             raise InputError(
                 f"{self.root}: images are {size[1]}x{size[0]}, the camera is for "
@@ -141,10 +144,7 @@ class ArraySequence(StreamSequence):
         depth = stored.astype(np.float32) / np.float32(self._units)
         if stored.dtype.kind == "u":
             depth[stored == np.iinfo(stored.dtype).max] = 0.0
-        if self._lens is None:
-            return Images(rgb, depth)
-        straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)
-        return Images(straight, straight_depth, mask=mask)
+        return straightened(self._lens, rgb, depth)
 
     def _frames(
         self, name: str, expected: str, shape: tuple[int, ...] | None = None

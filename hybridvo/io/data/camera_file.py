@@ -162,6 +162,16 @@ def _read_content(path: Path) -> dict[Any, Any]:
     return content
 
 
+def read_opencv_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML file of OpenCV, whose first line and tags are no plain YAML."""
+    text = read_text(path, MAX_YAML_LENGTH).replace("!!opencv-matrix", "")
+    lines = [line for line in text.split("\n") if not line.startswith("%")]
+    content = parse_yaml("\n".join(lines), str(path))
+    if not isinstance(content, dict):
+        raise FormatError(f"{path}: expected 'key: value' lines.")
+    return content
+
+
 def _calibration_of(path: Path, content: dict[Any, Any]) -> Calibration:
     """Make the calibration that the keys and values of a camera file describe."""
     missing = [key for key in CAMERA_KEYS if content.get(key) is None]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hybridvo.core.checks import as_number
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import read_text
 from hybridvo.core.geometry import invert, ned_to_camera, pose_matrix
 from hybridvo.core.trajectory import COLUMNS, read_poses
@@ -27,7 +27,11 @@ from hybridvo.io.data.camera_file import (
     read_camera_file,
 )
 from hybridvo.io.data.sequence import Sequence
-from hybridvo.io.data.stereo import MAX_DISPARITY_PX, STEREO_BLOCK_PX
+from hybridvo.io.data.stereo import (
+    DISPARITY_STEPS,
+    depth_from_disparity,
+    matcher_of,
+)
 
 # s: a recorder that leaves longer between two frames is no video
 LONGEST_DURATION_S = 1.0
@@ -110,10 +114,8 @@ class SintelSequence(Sequence):
         if path is None:
             raise FileNotFoundError(f"{self.name}: frame {index} has no .cam file.")
         K, _ = image_io.read_cam(path)
-        try:
+        with format_errors(path):
             return Camera.from_matrix(K, self.height, self.width)
-        except InputError as error:
-            raise FormatError(f"{path}: {error}") from None
 
     def _read_flow(
         self, path: Path, index: int
@@ -320,12 +322,15 @@ class TumSequence(Sequence):
     kind = "tum"
     true_path: TruePath | None = None
     depth_scale = 5000.0
-    markers = (("rgb.txt", "depth.txt"), ("associations.txt",))
+    markers: tuple[tuple[str, ...], ...] = (
+        ("rgb.txt", "depth.txt"),
+        ("associations.txt",),
+    )
 
     def _list_files(self) -> None:
         root = self.root
         if (root / "rgb.txt").exists():
-            self._match_lists()
+            self._match_lists("rgb.txt", "depth.txt")
         else:
             self._read_associations()
         icl_poses = min(root.glob("*.gt.freiburg"), default=None)
@@ -334,22 +339,20 @@ class TumSequence(Sequence):
         if pose_file.exists():
             self._match_poses(pose_file)
 
-    def _match_lists(self) -> None:
-        """Match the images of rgb.txt and the depth maps of depth.txt by time."""
-        stamps, rgb_names = self._read_list("rgb.txt")
-        depth_stamps, depth_names = self._read_list("depth.txt")
+    def _match_lists(self, colour: str, depth: str) -> None:
+        """Match the images and the depth maps of two lists by time."""
+        stamps, rgb_names = self._read_list(colour)
+        depth_stamps, depth_names = self._read_list(depth)
         if are_durations(stamps) and len(depth_names) == len(rgb_names):
             stamps = self._counted(len(stamps))
             depth_stamps = stamps
-        where = self.root / "rgb.txt"
+        where = self.root / colour
         pairs = lists.depth_at(stamps, depth_stamps, where, self.warnings)
         self.image_stamps = stamps
         self.timestamps = stamps[[i for i, _ in pairs]]
         self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
-        self.rgb_files = [self._file(rgb_names[i], "rgb.txt") for i, _ in pairs]
-        self.depth_files = [
-            self._file(depth_names[j], "depth.txt") for _, j in pairs
-        ]
+        self.rgb_files = [self._file(rgb_names[i], colour) for i, _ in pairs]
+        self.depth_files = [self._file(depth_names[j], depth) for _, j in pairs]
 
     def _read_list(self, name: str) -> tuple[np.ndarray, list[str]]:
         """Read a list ``timestamp filename``."""
@@ -462,7 +465,7 @@ class SevenScenesSequence(Sequence):
         numbers = self._list_numbered(rgb, depth)
         if pose_files:
             files = [pose_files.get(number) for number in numbers]
-            self._read_poses(files, _read_matrix)
+            self._read_poses(files, image_io.read_matrix)
 
     def _take_first_of_scene(self) -> None:
         """Go to the first sequence where the folder is that of a scene."""
@@ -481,23 +484,8 @@ class SevenScenesSequence(Sequence):
         return Calibration(Camera(585, 585, 320, 240, *KINECT_SIZE))
 
 
-def _read_matrix(path: Path) -> np.ndarray:
-    """Read T_world_cam (4, 4) from 16 numbers; NaN where tracking was lost: inf or nan in it."""
-    try:
-        T = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
-    except ValueError as error:
-        raise FormatError(
-            f"{path}: expected 16 numbers of a 4x4 matrix ({error})."
-        ) from None
-    if not np.isfinite(T).all():
-        return np.full((4, 4), np.nan)
-    return image_io.as_pose(T[:3], str(path))
-
-
 # -- KITTI odometry ----------------------------------------------------------------------
 
-DISPARITY_STEPS = 16
-"""OpenCV states disparities in steps of 1/16 pixel."""
 KITTI_DEPTH_EXPECTED = "depth/ (16-bit PNG, 256 per metre, or .npy, metres)"
 
 
@@ -583,10 +571,8 @@ class KittiSequence(Sequence):
 
     def _calibration(self) -> Calibration:
         K = self._P_left[:, :3]
-        try:
+        with format_errors(self.root / "calib.txt"):
             return Calibration(Camera.from_matrix(K, self.height, self.width))
-        except InputError as error:
-            raise FormatError(f"{self.root / 'calib.txt'}: {error}") from None
 
     def frame(self, index: int) -> Frame:
         """Read a frame; depth from stereo gets a variance of its logarithm.
@@ -604,23 +590,9 @@ class KittiSequence(Sequence):
             return super()._read_depth(path)
         left = self._read_grey(self._left_of[path])
         right = self._read_grey(path)
-        matcher = cv2.StereoSGBM.create(
-            numDisparities=_disparities_to_search(left.shape[1]),
-            blockSize=STEREO_BLOCK_PX,
-            # OpenCV recommends 8 and 32 times the pixels of a block.
-            P1=8 * STEREO_BLOCK_PX**2,
-            P2=32 * STEREO_BLOCK_PX**2,
-            disp12MaxDiff=1,
-            uniquenessRatio=10,
-            speckleWindowSize=100,
-            speckleRange=2,
-            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-        )
-        steps = matcher.compute(left, right).astype(np.float32)
-        disparity = steps / DISPARITY_STEPS
-        is_valid = disparity > 0
-        divisor = np.where(is_valid, disparity, 1)
-        return np.where(is_valid, self._disparity_at_1m / divisor, 0)
+        steps = matcher_of(left.shape[1]).compute(left, right)
+        disparity = steps.astype(np.float32) / DISPARITY_STEPS
+        return depth_from_disparity(disparity, self._disparity_at_1m)[0]
 
     def _read_grey(self, path: Path) -> np.ndarray:
         """Read an image as grey values, (H, W) uint8."""
@@ -628,34 +600,37 @@ class KittiSequence(Sequence):
         return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
 
 
-def _disparities_to_search(width: int) -> int:
-    """Return how many disparities are searched: a multiple of 16, at most half the width."""
-    half_width = width // 2 // 16 * 16
-    return min(MAX_DISPARITY_PX, max(16, half_width))
+def labelled_matrix(
+    path: Path, names: tuple[str, ...], shape: tuple[int, int]
+) -> np.ndarray:
+    """Read the numbers of the first line ``name: 1.0 2.0 ...`` of one of some names."""
+    for line, text in enumerate(read_text(path).split("\n"), start=1):
+        name, _, rest = text.partition(":")
+        if name.strip() not in names:
+            continue
+        numbers = np.array([as_number(word) for word in rest.split()])
+        if numbers.size == shape[0] * shape[1] and np.isfinite(numbers).all():
+            return numbers.reshape(shape)
+        expected = f"{shape[0] * shape[1]} numbers of {name.strip()}"
+        raise FormatError(
+            f"{path}:{line}: expected {expected}, got {rest.strip()[:80]!r}."
+        )
+    raise FormatError(f"{path}: expected a line '{names[0]}: ...', found none.")
 
 
 def _read_projection(path: Path, number: str) -> np.ndarray:
     """Read the (3, 4) projection of a rectified camera: fx 0 cx tx, 0 fy cy ty, 0 0 1 tz."""
-    names = (f"P{number}", f"P_rect_0{number}")
-    for line, text in enumerate(read_text(path).split("\n"), start=1):
-        name, _, rest = text.partition(":")
-        if name not in names:
-            continue
-        numbers = np.array([as_number(word) for word in rest.split()])
-        if numbers.size == 12:
-            P = numbers.reshape(3, 4)
-            if _is_projection(P):
-                return P
-        expected = f"{name}: fx 0 cx tx 0 fy cy ty 0 0 1 tz"
-        raise FormatError(
-            f"{path}:{line}: expected {expected}, got {rest[:200]!r}."
-        )
-    raise FormatError(f"{path}: expected a line 'P{number}: ...', found none.")
+    P = labelled_matrix(path, (f"P{number}", f"P_rect_0{number}"), (3, 4))
+    if _is_projection(P):
+        return P
+    raise FormatError(
+        f"{path}: P{number}: expected fx 0 cx tx 0 fy cy ty 0 0 1 tz, got {P.tolist()}."
+    )
 
 
 def _is_projection(P: np.ndarray) -> bool:
     """Return whether a matrix is the projection of a rectified camera."""
-    if not np.isfinite(P).all() or P[1, 0] != 0:
+    if P[1, 0] != 0:
         return False
     last_row_fits = np.allclose(P[2, :3], (0, 0, 1))
     focal_lengths_fit = P[0, 0] * P[1, 1] > 0

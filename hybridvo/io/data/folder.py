@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridvo.core.checks import as_number
 from hybridvo.core.errors import InputError
-from hybridvo.core.trajectory import stamp_unit, to_seconds
 from hybridvo.io.data import lists
 from hybridvo.io.data.camera_file import (
     CAMERA_FILE,
@@ -116,8 +114,10 @@ class FolderSequence(Sequence):
         frame_names = {path.stem for path in frames}
         depth_names = {path.stem for path in files}
         if frame_names.isdisjoint(depth_names):
-            stamps = self._stamps("timestamps.txt", frames)
-            depth_stamps = self._stamps("depth_timestamps.txt", files)
+            known = lists.known_stamps
+            stamps = known(frames, self.root / "timestamps.txt", self.warnings)
+            depth_list = self.root / "depth_timestamps.txt"
+            depth_stamps = known(files, depth_list, self.warnings)
             if stamps is not None and depth_stamps is not None:
                 pairs = lists.depth_at(
                     stamps, depth_stamps, self.root, self.warnings
@@ -181,30 +181,8 @@ class FolderSequence(Sequence):
 
     def _frame_stamps(self, frames: list[Path]) -> np.ndarray:
         """Return the stamps of all frames, seconds, at a frame rate where none are known."""
-        stamps = self._stamps("timestamps.txt", frames)
-        if stamps is not None:
-            return stamps
         fps = None if self._settings is None else self._settings.fps
-        if fps is None:
-            fps = self.frames_per_second
-            self._warn(f"no time stamps; {lists.assumed_rate(fps)}")
-        return np.arange(len(frames)) / fps
-
-    def _stamps(self, name: str, files: list[Path]) -> np.ndarray | None:
-        """Return stamps, seconds, from a list, else from file names; None if neither has them."""
-        path = self.root / name
-        if path.exists():
-            return lists.read_stamps_of(files, path, self.warnings)
-        values = np.array([as_number(file.stem) for file in files])
-        if not np.isfinite(values).all():
-            return None
-        # File names that only count frames are no stamps.
-        has_fractions = all("." in file.stem for file in files)
-        units_per_second, _ = stamp_unit(values)
-        if not has_fractions and units_per_second == 1:
-            return None
-        where = f"{files[0].parent.name}/ (file names)"
-        return to_seconds(values, where, self.warnings)
+        return lists.stamps_of_files(self.root, frames, fps, self.warnings)
 
 
 def _share_frame_numbers(frames: list[Path], files: list[Path]) -> bool:

@@ -20,16 +20,10 @@ class ForeignFolder(NamedTuple):
     kind: Foreign
 
 
-BAG = "name the bag itself: hybridvo run DIR/NAME"
-VIDEO = (
-    "a video has no depth: put a depth map of each frame into depth/ beside it (16-bit PNG or "
-    ".npy), or predict it with --depth onnx:FILE; write camera.yaml with 'hybridvo init DIR'"
-)
 SDK = "export colour images into rgb/ and registered depth into depth/ with its maker's tools"
 ARRAYS = (
-    "name the file itself if it is one .npz with rgb, depth and K; else stack them: one .npz, or "
-    "rgb.npy and depth.npy in a folder, with K and timestamps; in Python: "
-    "hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
+    "stack them: one .npz with rgb, depth and K, or rgb.npy and depth.npy in a folder, with K and "
+    "timestamps; in Python: hvo.Frame(rgb, depth, camera, timestamp=stamp), then vo.track(frame)"
 )
 RESULTS = "name the recording itself, which run.json states as 'sequence'"
 STEREO = (
@@ -41,51 +35,33 @@ PHONE = (
     "(millimetres: depth_scale 1000)"
 )
 
-ROS_1_BAG = Foreign("a ROS 1 bag or a RealSense recording", BAG)
-ROS_2_BAG = Foreign("a ROS 2 bag", BAG)
-VIDEO_FILE = Foreign("a video", VIDEO)
-MATROSKA = Foreign("a video or an Azure Kinect recording", VIDEO)
-NUMPY_ARRAYS = Foreign("arrays of numpy", ARRAYS)
-SCANNET = Foreign("a ScanNet recording", BAG)
 ZED = Foreign("a ZED recording", SDK)
 DEPTH_CAMERA = Foreign("a recording of a depth camera", SDK)
-RECORD3D = Foreign("a Record3D recording", BAG)
-RECORD3D_EXPORT = Foreign("a Record3D export", PHONE)
-RUN_FOLDER = Foreign("what 'hybridvo run' has written", RESULTS)
 EUROC = Foreign("a EuRoC recording", STEREO)
-ARKIT_SCENES = Foreign("an ARKitScenes recording", PHONE)
-RS_CONVERT = Foreign(
-    "what rs-convert writes of a RealSense recording, with depth as colours",
-    "give the .bag itself",
-)
 
 FILES: dict[str, Foreign] = {
-    ".bag": ROS_1_BAG,
-    ".mcap": ROS_2_BAG,
-    ".db3": ROS_2_BAG,
-    ".mp4": VIDEO_FILE,
-    ".avi": VIDEO_FILE,
-    ".mov": VIDEO_FILE,
-    ".m4v": VIDEO_FILE,
-    ".webm": VIDEO_FILE,
-    ".mkv": MATROSKA,
-    ".npz": NUMPY_ARRAYS,
-    ".npy": NUMPY_ARRAYS,
+    ".npy": Foreign("arrays of numpy", ARRAYS),
     ".svo": ZED,
     ".svo2": ZED,
     ".oni": DEPTH_CAMERA,
     ".klg": DEPTH_CAMERA,
-    ".sens": SCANNET,
-    ".r3d": RECORD3D,
 }
 """Kinds of recordings by the ending of their file."""
 FOLDERS: tuple[ForeignFolder, ...] = (
-    ForeignFolder(("run.json", "steps.*"), RUN_FOLDER),
+    ForeignFolder(
+        ("run.json", "steps.*"), Foreign("what 'hybridvo run' has written", RESULTS)
+    ),
     ForeignFolder(("mav0",), EUROC),
     ForeignFolder(("cam0/data.csv",), EUROC),
-    ForeignFolder(("metadata.json", "rgbd"), RECORD3D_EXPORT),
-    ForeignFolder(("lowres_depth",), ARKIT_SCENES),
-    ForeignFolder(("*_Color_*.png", "*_Depth_*.*"), RS_CONVERT),
+    ForeignFolder(("metadata.json", "rgbd"), Foreign("a Record3D export", PHONE)),
+    ForeignFolder(("lowres_depth",), Foreign("an ARKitScenes recording", PHONE)),
+    ForeignFolder(
+        ("*_Color_*.png", "*_Depth_*.*"),
+        Foreign(
+            "what rs-convert writes of a RealSense recording, with depth as colours",
+            "give the .bag itself",
+        ),
+    ),
 )
 """Kinds of recordings by the names in their folder; the first that fits is taken."""
 
@@ -110,8 +86,6 @@ def recognised(path: Path) -> str:
     for inside in sorted(path.iterdir()):
         kind = FILES.get(inside.suffix.lower())
         if kind is not None and inside.is_file():
-            if kind.remedy == BAG:
-                return f"it holds {inside.name}: {kind.description}: {kind.remedy}"
             return f"it holds {inside.name}: {_description(kind)}"
     return ""
 

@@ -12,7 +12,14 @@ import numpy as np
 
 from hybridvo.core.checks import as_rigid
 from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.files import atomic_write, file_size, read_bytes, read_head
+from hybridvo.core.files import (
+    atomic_write,
+    file_size,
+    make_folder,
+    read_bytes,
+    read_head,
+    read_text,
+)
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.trajectory import FILE_TOLERANCE
 
@@ -264,6 +271,24 @@ def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
         raise FormatError(str(error)) from None
 
 
+def numbers_of_matrix(path: Path) -> np.ndarray:
+    """Read a matrix (4, 4) from a text of 16 numbers; they may be infinite."""
+    try:
+        return np.array(read_text(path).split(), np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise FormatError(
+            f"{path}: expected 16 numbers of a 4x4 matrix ({error})."
+        ) from None
+
+
+def read_matrix(path: Path) -> np.ndarray:
+    """Read a pose (4, 4) from a text of 16 numbers; NaN where tracking was lost."""
+    T = numbers_of_matrix(path)
+    if not np.isfinite(T).all():
+        return np.full((4, 4), np.nan)
+    return as_pose(T[:3], str(path))
+
+
 def read_npy(
     path: str | Path, *, channels: int | None = None, size: Size = None
 ) -> np.ndarray:
@@ -313,6 +338,13 @@ def _check_npy_shape(
     raise FormatError(
         f"{path}: expected an array of numbers of shape {shape}, got {got}."
     )
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write a PNG, in OpenCV's order of channels, into a folder that is made if needed."""
+    make_folder(path.parent)
+    with atomic_write(path, "wb") as file:
+        file.write(cv2.imencode(".png", image)[1].tobytes())
 
 
 def write_flo(path: str | Path, flow: np.ndarray) -> None:

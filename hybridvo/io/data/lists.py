@@ -6,15 +6,18 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from hybridvo.core.checks import as_number
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import read_rows
 from hybridvo.core.trajectory import (
     COLUMNS,
     check_increasing,
     read_poses,
+    stamp_unit,
     to_seconds,
 )
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
@@ -35,6 +38,8 @@ PICTURES = (
 """Endings of images, most of which are not read."""
 RATE_IS_ASSUMED = "frames a second assumed"
 """What a warning says of a sequence without time stamps."""
+ASSUMED_FPS = 30.0
+"""That rate, unless a data set states another."""
 MAX_FRAME_NUMBER = 10**12
 """Largest frame number in the name of a file."""
 SORTED_DIGITS = 20
@@ -224,9 +229,9 @@ def assumed_rate(rate: float) -> str:
 
 
 def read_stamps_of(
-    files: Sequence[Path], path: Path, warnings: list[str]
+    files: Sequence[Any] | np.ndarray, path: Path, warnings: list[str]
 ) -> np.ndarray:
-    """Read a list of time stamps, one for each of some files.
+    """Read a list of time stamps, one for each of some files or frames.
 
     Args:
         files: The files, in the order of the list.
@@ -245,6 +250,45 @@ def read_stamps_of(
             f"{path}: {len(stamps)} stamps for {len(files)} files: expected a line for each."
         )
     return stamps
+
+
+def known_stamps(
+    files: Sequence[Path], path: Path, warnings: list[str]
+) -> np.ndarray | None:
+    """Return the stamps of files, s, from a list if it exists, else from their names.
+
+    Returns:
+        (N,) seconds; None where there is no list, and the names only count the files.
+    """
+    if path.exists():
+        return read_stamps_of(files, path, warnings)
+    names = np.array([as_number(file.stem) for file in files])
+    if not np.isfinite(names).all():
+        return None
+    has_points = all("." in file.stem for file in files)
+    if not has_points and stamp_unit(names)[0] == 1:
+        return None
+    return to_seconds(names, f"{files[0].parent.name}/ (file names)", warnings)
+
+
+def stamps_of_files(
+    root: Path, files: Sequence[Path], fps: float | None, warnings: list[str]
+) -> np.ndarray:
+    """Return the stamps of files, s: of ``timestamps.txt``, of their names, or counted.
+
+    Args:
+        root: The folder in which ``timestamps.txt`` may be.
+        files: The files in their order.
+        fps: Files a second where nothing states their times; by default 30, with a warning.
+        warnings: Gets sentences about what was assumed.
+    """
+    stamps = known_stamps(files, root / "timestamps.txt", warnings)
+    if stamps is not None:
+        return stamps
+    if fps is None:
+        fps = ASSUMED_FPS
+        warnings.append(f"{root.name}: no time stamps; {assumed_rate(fps)}.")
+    return np.arange(len(files)) / fps
 
 
 def read_stamps(

@@ -25,7 +25,6 @@ from hybridvo.io.data.confined.limits import is_confined
 from hybridvo.io.data.confined.sequence import ConfinedSequence
 from hybridvo.io.data.folder import FolderSequence
 from hybridvo.io.data.foreign import recognised
-from hybridvo.io.data.layouts import lack_of
 from hybridvo.io.data.lists import abbreviated, images_elsewhere
 from hybridvo.io.data.predicted import PredictedSequence
 from hybridvo.io.data.published.kitti_raw import KittiRawSequence
@@ -366,8 +365,8 @@ def _why_unknown(folder: Path) -> str:
     if inside := _sequences_among(entries):
         others = f" It also holds {abbreviated(inside[1:])}." if inside[1:] else ""
         return f"holds sequences: give one, such as {folder / inside[0]}.{others}"
-    if lack := lack_of(folder):
-        return f"{lack}."
+    if lack := _lack_of(folder):
+        return lack
     above = folder.absolute().parent
     if any(reader.knows(above) for reader in READERS.values()):
         return f"a part of a sequence: give the folder above it, {above}."
@@ -377,6 +376,23 @@ def _why_unknown(folder: Path) -> str:
     kinds = ", ".join(kind for kind in READERS if kind != FolderSequence.kind)
     text = f"not a layout that is read ({kinds}). It holds: {content}; {where}."
     return f"{text} {OWN_DATA}"
+
+
+def _lack_of(folder: Path) -> str:
+    """Name the kind of which half of the files are there, and what it lacks; else empty."""
+    for kind, reader in READERS.items():
+        for names in reader.markers:
+            missing = [name for name in names if not _is_there(folder, name)]
+            # a folder such as depth/ tells nothing
+            tells = any("." in name for name in names if name not in missing)
+            if tells and 2 * len(missing) <= len(names):
+                return f"of kind '{kind}', without {' and '.join(missing)}."
+    return ""
+
+
+def _is_there(folder: Path, name: str) -> bool:
+    """Whether a folder holds a file or folder of a name with wildcards; a pipe is neither."""
+    return any(path.is_file() or path.is_dir() for path in folder.glob(name))
 
 
 def _sequences_among(entries: list[Path]) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from hybridvo.core.checks import brief
 from hybridvo.core.depth_units import depth_unit_fix, typical_depth
-from hybridvo.core.errors import FormatError, InputError, printable
+from hybridvo.core.errors import FormatError, InputError, format_errors, printable
 from hybridvo.core.imu import ImuSamples, rising
 from hybridvo.core.trajectory import check_increasing
 from hybridvo.core.types import Camera, Frame
@@ -255,10 +255,8 @@ class Sequence:
             rgb, depth, mask = undistort(self._lens, rgb, depth, mask)
         camera = self.camera(index)
         stamp = float(self.timestamps[index])
-        try:
+        with format_errors(where):
             return Frame(rgb, depth, camera, stamp, index, mask=mask)
-        except InputError as error:
-            raise FormatError(f"{where}: {error}") from None
 
     def flow(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Read the flow from a frame to the next one.
@@ -330,9 +328,7 @@ class Sequence:
             raise InputError(
                 f"{path}: depth is of whole numbers: expected {needed}."
             )
-        depth = stored.astype(np.float32) / np.float32(scale)
-        depth[stored == SATURATED] = 0.0
-        return depth
+        return in_metres(stored, scale)
 
     def _read_flow(
         self, path: Path, index: int
@@ -571,6 +567,13 @@ class Sequence:
         if first is not None:
             text += f", such as {first}"
         self._warn(text)
+
+
+def in_metres(stored: np.ndarray, units: float) -> np.ndarray:
+    """Return depth (H, W) as float32 metres; it is stored in units per metre."""
+    depth = stored.astype(np.float32) / np.float32(units)
+    depth[stored == SATURATED] = 0.0
+    return depth
 
 
 def _read_existing(path: Path | None, read: Callable[[Path], np.ndarray]) -> Image:

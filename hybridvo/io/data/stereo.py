@@ -21,7 +21,8 @@ from hybridvo.io.data.streams import Images, Lens
 MAX_DISPARITY_PX = 128
 # px, of the side of the blocks of two images that are compared
 STEREO_BLOCK_PX = 5
-
+DISPARITY_STEPS = 16
+"""OpenCV states disparities in steps of 1/16 pixel."""
 MIN_BASELINE_M = 1e-4
 """Two cameras that are closer are one."""
 
@@ -131,6 +132,24 @@ def stereo_images(left: np.ndarray, right: np.ndarray, rig: Rectified) -> Images
     return Images(left, depth, variance, mask)
 
 
+def matcher_of(width: int) -> cv2.StereoSGBM:
+    """Return a matcher of rectified images with so many columns."""
+    area = STEREO_BLOCK_PX * STEREO_BLOCK_PX
+    return cv2.StereoSGBM.create(
+        # narrow images cannot be searched as far
+        numDisparities=min(MAX_DISPARITY_PX, max(16, width // 2 // 16 * 16)),
+        blockSize=STEREO_BLOCK_PX,
+        # OpenCV recommends 8 and 32 times the pixels of a block
+        P1=8 * area,
+        P2=32 * area,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+
+
 def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the disparity of rectified images by semi-global block matching.
 
@@ -143,20 +162,8 @@ def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
         unknown.
     """
     width = left.shape[1]
-    # narrow images cannot be searched as far
-    reach = min(MAX_DISPARITY_PX, max(16, width // 2 // 16 * 16))
-    area = STEREO_BLOCK_PX * STEREO_BLOCK_PX
-    matcher = cv2.StereoSGBM.create(
-        numDisparities=reach,
-        blockSize=STEREO_BLOCK_PX,
-        P1=8 * area,
-        P2=32 * area,
-        disp12MaxDiff=1,
-        uniquenessRatio=10,
-        speckleWindowSize=100,
-        speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )
+    matcher = matcher_of(width)
+    reach = matcher.getNumDisparities()
     # the matcher leaves out as many columns at the left as it searches
     left_grey, right_grey = (
         cv2.copyMakeBorder(
@@ -170,7 +177,7 @@ def match(left: np.ndarray, right: np.ndarray) -> np.ndarray:
         for image in (left, right)
     )
     steps = matcher.compute(left_grey, right_grey)[:, reach:]
-    disparity = steps.astype(np.float32) / 16
+    disparity = steps.astype(np.float32) / DISPARITY_STEPS
     # what the right camera does not see was matched to the border
     columns = np.arange(width, dtype=np.float32)
     return np.where(columns >= disparity, disparity, -1)

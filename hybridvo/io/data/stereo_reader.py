@@ -10,12 +10,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number, as_rigid
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import MAX_YAML_LENGTH, parse_yaml, read_rows, read_text
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.types import Camera
 from hybridvo.io.data import lists
-from hybridvo.io.data.camera_file import CAMERA_FILE, parse_camera
+from hybridvo.io.data.camera_file import (
+    CAMERA_FILE,
+    parse_camera,
+    read_opencv_yaml,
+)
 from hybridvo.io.data.image_io import image_size, read_rgb
 from hybridvo.io.data.stereo import (
     Rectified,
@@ -30,7 +34,6 @@ from hybridvo.io.data.streams import (
     Lens,
     StreamSequence,
     check_lens,
-    stamps_of_files,
 )
 
 # s, between the two images of a pair: cameras that are triggered together state the
@@ -99,10 +102,6 @@ class StereoSequence(StreamSequence):
 
 STAMP_DIGITS = 19
 """Of nanoseconds since 1970, for the next three hundred years."""
-
-
-STAMP_DIGITS = 19
-"""Of nanoseconds since 1970, until the year 2286."""
 
 
 class EurocSequence(StereoSequence):
@@ -215,7 +214,7 @@ class OwnStereoSequence(StereoSequence):
         settings = self._settings(left[0])
         fps = settings.get("fps")
         rate = None if fps is None else as_number(fps)
-        left_stamps = stamps_of_files(self.root, left, rate, self.warnings)
+        left_stamps = lists.stamps_of_files(self.root, left, rate, self.warnings)
         if {path.stem for path in left} & {path.stem for path in right}:
             by_name = {path.stem: path for path in right}
             kept = [i for i, path in enumerate(left) if path.stem in by_name]
@@ -224,7 +223,9 @@ class OwnStereoSequence(StereoSequence):
         elif len(left) == len(right):
             right_stamps = left_stamps
         else:
-            right_stamps = stamps_of_files(self.root, right, None, self.warnings)
+            right_stamps = lists.stamps_of_files(
+                self.root, right, None, self.warnings
+            )
         self._take_pairs(left, left_stamps, right, right_stamps)
         rig, size_taken = rig_of_settings(settings, str(self.root / CAMERA_FILE))
         self._take_rig(rig, size_taken)
@@ -334,10 +335,8 @@ def _camera(content: dict[str, Any], height: Any, width: Any) -> Camera:
 def _own_lens(content: Any, height: Any, width: Any, where: str) -> Lens:
     if not isinstance(content, dict):
         raise FormatError(f"{where}: expected fx, fy, cx, cy and distortion.")
-    try:
+    with format_errors(where):
         camera = _camera(content, height, width)
-    except InputError as error:
-        raise FormatError(f"{where}: {error}") from None
     distortion = tuple(
         as_number(value) for value in content.get("distortion") or ()
     )
@@ -348,12 +347,8 @@ def _own_lens(content: Any, height: Any, width: Any, where: str) -> Lens:
 
 def _read_sensor(path: Path) -> tuple[Lens, np.ndarray]:
     """The lens in a ``sensor.yaml`` of EuRoC, and its place in the body, (4, 4)."""
-    text = read_text(path, MAX_YAML_LENGTH)
-    lines = text.split("\n")
-    # OpenCV's "%YAML:1.0" is no YAML
-    plain = "\n".join(line for line in lines if not line.startswith("%"))
-    content = parse_yaml(plain, str(path))
-    if not isinstance(content, dict) or not isinstance(content.get("T_BS"), dict):
+    content = read_opencv_yaml(path)
+    if not isinstance(content.get("T_BS"), dict):
         raise FormatError(f"{path}: expected a sensor.yaml with T_BS.")
     try:
         T = np.array(content["T_BS"].get("data"), np.float64).reshape(4, 4)

@@ -8,20 +8,18 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.core.checks import as_number
 from hybridvo.core.depth_units import depth_unit_fix, typical_depth
-from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.trajectory import check_increasing, stamp_unit, to_seconds
+from hybridvo.core.errors import FormatError, InputError, format_errors
+from hybridvo.core.trajectory import check_increasing
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.image_io import read_mask_png
-from hybridvo.io.data.lists import (
-    IMAGES,
-    assumed_rate,
-    match_files,
-    read_stamps_of,
-    sorted_files,
+from hybridvo.io.data.lists import IMAGES, match_files, sorted_files
+from hybridvo.io.data.sequence import (
+    Files,
+    Sequence,
+    UndistortionMaps,
+    undistort,
 )
-from hybridvo.io.data.sequence import Files, Sequence, UndistortionMaps
 
 FISHEYE_MODELS = ("equidistant", "kannala_brandt4", "fisheye", "kannala_brandt")
 """What ROS and others call OpenCV's fisheye model, of four coefficients."""
@@ -47,6 +45,16 @@ class Images(NamedTuple):
     depth: np.ndarray | None  # (H, W) float32 metres, not positive where unknown
     depth_variance: np.ndarray | None = None  # (H, W) of log depth
     mask: np.ndarray | None = None  # (H, W) bool, False where not to be used
+
+
+def straightened(
+    maps: UndistortionMaps | None, rgb: np.ndarray, depth: np.ndarray | None
+) -> Images:
+    """Return images without the distortion of a lens; as they are where it has none."""
+    if maps is None:
+        return Images(rgb, depth)
+    straight, straight_depth, mask = undistort(maps, rgb, depth, None)
+    return Images(straight, straight_depth, mask=mask)
 
 
 class Lens(NamedTuple):
@@ -148,7 +156,7 @@ class StreamSequence(Sequence):
             raise FormatError(f"{where}: neither image nor depth is there.")
         camera = self.camera(index)
         stamp = float(self.timestamps[index])
-        try:
+        with format_errors(where):
             return Frame(
                 images.rgb,
                 images.depth,
@@ -158,8 +166,6 @@ class StreamSequence(Sequence):
                 depth_variance=images.depth_variance,
                 mask=self._mask(index, images.mask),
             )
-        except InputError as error:
-            raise FormatError(f"{where}: {error}") from None
 
     def files(self) -> list[Path]:
         """Return the files that are read."""
@@ -215,34 +221,6 @@ class StreamSequence(Sequence):
             except (InputError, OSError) as error:
                 first_error = first_error or error
         raise first_error or InputError(f"{self.root}: no frames.")
-
-
-def stamps_of_files(
-    root: Path, files: list[Path], fps: float | None, warnings: list[str]
-) -> np.ndarray:
-    """Return the stamps of some files, s.
-
-    They stand in ``timestamps.txt``, or are the names of the files; else the files are counted.
-
-    Args:
-        root: The folder in which ``timestamps.txt`` may be.
-        files: The files in their order.
-        fps: Files a second where nothing states their times; by default 30, with a warning.
-        warnings: Gets sentences about what was assumed.
-    """
-    listed = root / "timestamps.txt"
-    if listed.exists():
-        return read_stamps_of(files, listed, warnings)
-    names = np.array([as_number(file.stem) for file in files])
-    # names that only count frames are no stamps
-    has_points = all("." in file.stem for file in files)
-    is_stamp = has_points or stamp_unit(names)[0] != 1
-    if np.isfinite(names).all() and is_stamp:
-        return to_seconds(names, f"{files[0].parent.name}/ (file names)", warnings)
-    if fps is None:
-        fps = StreamSequence.frames_per_second
-        warnings.append(f"{root.name}: no time stamps; {assumed_rate(fps)}.")
-    return np.arange(len(files)) / fps
 
 
 def units_per_metre(

@@ -11,10 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import read_rows, read_text
 from hybridvo.core.geometry import make_transform
-from hybridvo.core.trajectory import stamp_unit, to_seconds
 from hybridvo.core.types import Camera
 from hybridvo.io.data import lists
 from hybridvo.io.data.camera_file import (
@@ -25,8 +24,14 @@ from hybridvo.io.data.camera_file import (
 )
 from hybridvo.io.data.image_io import image_size, read_depth, read_mask_png
 from hybridvo.io.data.resize import resize_camera
-from hybridvo.io.data.sequence import SATURATED, undistort
-from hybridvo.io.data.streams import Images, Lens, StreamSequence, units_per_metre
+from hybridvo.io.data.sequence import in_metres
+from hybridvo.io.data.streams import (
+    Images,
+    Lens,
+    StreamSequence,
+    straightened,
+    units_per_metre,
+)
 
 VIDEOS = (".mp4", ".avi", ".mov", ".m4v", ".webm", ".mkv")
 DEPTHS = (".png", ".npy", ".dpt")
@@ -170,12 +175,7 @@ class VideoSequence(StreamSequence):
         listed = self._folder / "timestamps.txt"
         count = len(self._video)
         if listed.exists():
-            stamps, _ = lists.read_stamps(listed, self.warnings)
-            if len(stamps) != count:
-                raise InputError(
-                    f"{listed}: {len(stamps)} stamps for {count} frames of the video."
-                )
-            return stamps
+            return lists.read_stamps_of(self._video.times, listed, self.warnings)
         if self._video.has_times:
             return self._video.times
         rate = self._video.rate if self._video.rate > 0 else self.frames_per_second
@@ -195,39 +195,25 @@ class VideoSequence(StreamSequence):
         count = len(stamps)
         numbers = [int(p.stem) if p.stem.isdecimal() else -1 for p in files]
         listed = self._folder / "depth_timestamps.txt"
-        if listed.exists():
-            depth_stamps, _ = lists.read_stamps(listed, self.warnings)
-            if len(depth_stamps) != len(files):
-                got = f"{len(depth_stamps)} stamps for {len(files)} files"
-                raise InputError(f"{listed}: {got}.")
-            pairs = lists.depth_at(stamps, depth_stamps, self.root, self.warnings)
-        elif len(files) == count:
+        if len(files) == count and not listed.exists():
             pairs = [(i, i) for i in range(count)]
-        elif min(numbers) >= 0 and max(numbers) < count:
+        elif min(numbers) >= 0 and max(numbers) < count and not listed.exists():
             pairs = [(number, j) for j, number in enumerate(numbers)]
             self._warn(f"{count - len(pairs)} of {count} frames have no depth")
         else:
-            pairs = self._by_names(files, stamps)
+            depth_stamps = lists.known_stamps(files, listed, self.warnings)
+            if depth_stamps is None:
+                raise InputError(
+                    f"{self.root}: {len(files)} depth maps for {count} frames: name them by "
+                    "the number of their frame, from 0, or write depth_timestamps.txt."
+                )
+            pairs = lists.depth_at(stamps, depth_stamps, self.root, self.warnings)
         self.rgb_files = []
         self._frame_at = [i for i, _ in pairs]
         self.depth_files = [files[j] for _, j in pairs]
         self.timestamps = stamps[self._frame_at]
         size = image_size(files[0])
         self._check_size(size, files[0])
-
-    def _by_names(
-        self, files: list[Path], stamps: np.ndarray
-    ) -> list[tuple[int, int]]:
-        """Pairs of frames and files whose names are times in the video."""
-        names = np.array([as_number(path.stem) for path in files])
-        is_stamp = all("." in p.stem for p in files) or stamp_unit(names)[0] != 1
-        if not np.isfinite(names).all() or not is_stamp:
-            raise InputError(
-                f"{self.root}: {len(files)} depth maps for {len(stamps)} frames: name them by "
-                "the number of their frame, from 0, or write depth_timestamps.txt."
-            )
-        depth_stamps = to_seconds(names, "depth (file names)", self.warnings)
-        return lists.depth_at(stamps, depth_stamps, self.root, self.warnings)
 
     def _check_size(self, size: tuple[int, int], path: Path) -> None:
         camera = self.camera(0)
@@ -279,10 +265,7 @@ class VideoSequence(StreamSequence):
         depth = None
         if self._needs_depth:
             depth = self._depth_of(index, self.camera(0).shape)
-        if self._lens is None:
-            return Images(rgb, depth)
-        straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)
-        return Images(straight, straight_depth, mask=mask)
+        return straightened(self._lens, rgb, depth)
 
     def _depth_of(self, index: int, size: tuple[int, int]) -> np.ndarray:
         """Depth of a frame, (H, W) float32 metres."""
@@ -297,9 +280,7 @@ class VideoSequence(StreamSequence):
                 f"{path}: depth is of whole numbers: expected 'depth_scale' in {CAMERA_FILE}, "
                 "or --depth-scale: units per metre, 1000 for mm."
             )
-        depth = stored.astype(np.float32) / np.float32(self._given_scale)
-        depth[stored == SATURATED] = 0.0
-        return depth
+        return in_metres(stored, self._given_scale)
 
 
 def _videos(folder: Path) -> list[Path]:
@@ -357,10 +338,8 @@ class StrayScannerSequence(VideoSequence):
             return parse_camera(self._given_camera, size, self.warnings).camera
         path = self.root / "camera_matrix.csv"
         K = read_rows(path, "fx 0 cx").numbers
-        try:
+        with format_errors(path):
             return Camera.from_matrix(K, *size)
-        except InputError as error:
-            raise FormatError(f"{path}: {error}") from None
 
     def _check_size(self, size: tuple[int, int], path: Path) -> None:
         if size != self._depth_size:

@@ -491,10 +491,7 @@ def test_a_pipe_in_the_folder_of_a_bag(name: str, tmp_path: Path) -> None:
     alone = tmp_path / "alone"
     alone.mkdir()
     os.mkfifo(alone / name)
-    without_messages = "a ROS 2 bag without *.mcap"
-    is_metadata = name == "metadata.yaml"
-    expected = without_messages if is_metadata else "not a layout that is read"
-    assert expected in refusal(alone)
+    assert "not a layout that is read" in refusal(alone)
     path = bags.plain_bag(tmp_path, "mcap")
     metadata = path / "metadata.yaml"
     if name == metadata.name:

@@ -261,13 +261,12 @@ def test_a_bag_without_depth_is_opened_for_a_network(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parts", "begin"),
     [
-        (("rgb.txt", "depths/", "images/"), "a TUM recording without rgb"),
-        (("image_2/", "times.txt"), "a KITTI sequence without calib.txt"),
-        (("seq-01.zip", "seq-02.zip"), "a scene of 7-Scenes without seq-*/frame"),
+        (("rgb.txt", "depth/"), "of kind 'tum', without depth.txt"),
+        (("calib.txt", "times.txt"), "of kind 'kitti', without image_2"),
         (("rgb/",), "not a layout that is read"),
     ],
 )
-def test_a_refusal_begins_with_the_nearest_layout(
+def test_a_refusal_names_what_is_missing_of_a_layout(
     parts: tuple[str, ...], begin: str, tmp_path: Path
 ) -> None:
     root = tmp_path / "walk"

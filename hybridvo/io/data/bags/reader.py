@@ -28,8 +28,14 @@ from hybridvo.io.data.bags.topics import (
 )
 from hybridvo.io.data.camera_file import parse_camera
 from hybridvo.io.data.registration import register_depth
-from hybridvo.io.data.sequence import UndistortionMaps, undistort
-from hybridvo.io.data.streams import Images, Lens, StreamSequence, units_per_metre
+from hybridvo.io.data.sequence import UndistortionMaps
+from hybridvo.io.data.streams import (
+    Images,
+    Lens,
+    StreamSequence,
+    straightened,
+    units_per_metre,
+)
 
 MILLIMETRES = 1000.0
 """Units per metre of depth in whole numbers, as REP 118 has it."""
@@ -435,14 +441,8 @@ class BagSequence(StreamSequence):
             raise FormatError(f"{self.name}: frame {index}: {error}") from None
         if depth is not None and self._T_rgb_depth is not None:
             depth = self._registered(depth)
-            if self._lens is None:
-                return Images(rgb, depth)
-            straight, _, mask = undistort(self._lens, rgb, None, None)
-            return Images(straight, depth, mask=mask)
-        if self._lens is None:
-            return Images(rgb, depth)
-        straight, straight_depth, mask = undistort(self._lens, rgb, depth, None)
-        return Images(straight, straight_depth, mask=mask)
+            return straightened(self._lens, rgb, None)._replace(depth=depth)
+        return straightened(self._lens, rgb, depth)
 
     def _registered(self, depth: np.ndarray) -> np.ndarray:
         if self._depth_lens is not None:

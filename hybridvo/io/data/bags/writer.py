@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -66,14 +65,10 @@ class BagWriter:
             self._writer.close()
 
     def discard(self) -> None:
-        """Remove a bag that did not become whole."""
-        # of many kinds
+        """Close a bag that did not become whole; its file is left."""
+        # errors of many kinds
         with contextlib.suppress(Exception):
             self._writer.close()
-        if self.path.is_dir():
-            shutil.rmtree(self.path, ignore_errors=True)
-        else:
-            self.path.unlink(missing_ok=True)
 
     def image(
         self, topic: str, pixels: np.ndarray, encoding: str, stamp: float

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from hybridvo.core.checks import as_number
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import read_head
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
@@ -441,7 +441,7 @@ def _lens_of(
         )
     width, height = modes[size].sensor
     left, top = modes[size].crop
-    try:
+    with format_errors(f"{where}: calibration.json"):
         pinhole = Camera(
             p["fx"] * width,
             p["fy"] * height,
@@ -450,8 +450,6 @@ def _lens_of(
             size[1],
             size[0],
         )
-    except InputError as error:
-        raise FormatError(f"{where}: calibration.json: {error}") from None
     order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     return Lens(pinhole, tuple(p[name] for name in order), "rational_polynomial")
 

@@ -12,7 +12,6 @@ from hybridvo.io.data.camera_file import (
     read_camera_file,
 )
 from hybridvo.io.data.folder import FolderSequence
-from hybridvo.io.data.layouts import lack_of
 
 IMAGE_FOLDERS = ("color", "colour")
 """What the folder of the images is called."""
@@ -57,7 +56,10 @@ class RecorderSequence(FolderSequence):
             return None
         if path is None:
             # other programs write the same folders
-            raise InputError(f"{self.root}: {lack_of(self.root)}.")
+            raise InputError(
+                f"{self.root}: no file of the camera: expected one of {', '.join(RECORDER_FILES)} "
+                "(ScanNet: intrinsic/intrinsic_color.txt), or give --camera fx,fy,cx,cy."
+            )
         settings = read_camera_file(path, self.warnings)
         if self._given_scale is None:
             self._given_scale = settings.depth_scale

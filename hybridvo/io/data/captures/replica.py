@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridvo.core.checks import as_number
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import MAX_YAML_LENGTH, parse_yaml, read_rows, read_text
 from hybridvo.core.types import Camera
 from hybridvo.io.data import lists
@@ -79,10 +79,8 @@ class ReplicaSequence(Sequence):
         width = int(stated["w"])
         focal_lengths = stated["fx"], stated["fy"]
         centre = stated["cx"], stated["cy"]
-        try:
+        with format_errors(self._file()):
             return Calibration(Camera(*focal_lengths, *centre, height, width))
-        except InputError as error:
-            raise FormatError(f"{self._file()}: {error}") from None
 
 
 def _read_poses(path: Path) -> np.ndarray:

@@ -11,8 +11,8 @@ from typing import IO, NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.files import file_size, read_text
+from hybridvo.core.errors import FormatError, InputError, format_errors
+from hybridvo.core.files import file_size
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
 from hybridvo.io.data import lists
@@ -21,10 +21,12 @@ from hybridvo.io.data.image_io import (
     as_pose,
     decode_bytes,
     image_size,
+    numbers_of_matrix,
     read_depth,
+    read_matrix,
     read_rgb,
 )
-from hybridvo.io.data.sequence import SATURATED
+from hybridvo.io.data.sequence import in_metres
 from hybridvo.io.data.streams import Images, Lens, StreamSequence, units_per_metre
 from hybridvo.io.data.two_cameras import TwoCameras
 
@@ -110,13 +112,9 @@ class ScanNetSequence(StreamSequence):
         for name in names:
             path = self.root / name
             if path.is_file():
-                try:
+                with format_errors(path):
                     K = numbers_of_matrix(path)[:3, :3]
                     return Camera.from_matrix(K, *size)
-                except FormatError:
-                    raise
-                except InputError as error:
-                    raise FormatError(f"{path}: {error}") from None
         return None
 
     def _images(self, index: int) -> Images:
@@ -128,31 +126,6 @@ class ScanNetSequence(StreamSequence):
         if depth_file is not None and self._needs_depth:
             depth = in_metres(read_depth(depth_file, depth_size), self._units)
         return self._cameras.images(rgb, depth)
-
-
-def in_metres(stored: np.ndarray, units: float) -> np.ndarray:
-    """Return depth as it is stored, (H, W) of whole numbers, as float32 metres."""
-    depth = stored.astype(np.float32) / np.float32(units)
-    depth[stored == SATURATED] = 0.0
-    return depth
-
-
-def numbers_of_matrix(path: Path) -> np.ndarray:
-    """Read a matrix (4, 4) from a text of 16 numbers; they may be infinite."""
-    try:
-        return np.array(read_text(path).split(), np.float64).reshape(4, 4)
-    except ValueError as error:
-        raise FormatError(
-            f"{path}: expected 16 numbers of a 4x4 matrix ({error})."
-        ) from None
-
-
-def read_matrix(path: Path) -> np.ndarray:
-    """Read a pose (4, 4) from a text of 16 numbers; NaN where tracking was lost."""
-    T = numbers_of_matrix(path)
-    if not np.isfinite(T).all():
-        return np.full((4, 4), np.nan)
-    return as_pose(T[:3], str(path))
 
 
 # -- .sens -------------------------------------------------------------------------------
@@ -328,11 +301,9 @@ def read_sens_head(path: Path, file: IO[bytes]) -> SensHead:
         raise FormatError(
             f"{path}: {count} frames of {units} units per metre cannot be."
         )
-    try:
+    with format_errors(path):
         colour = Camera.from_matrix(K_colour[:3, :3], colour_height, colour_width)
         depth = Camera.from_matrix(K_depth[:3, :3], depth_height, depth_width)
-    except InputError as error:
-        raise FormatError(f"{path}: {error}") from None
     # each maps points of its camera into the frame that poses are of
     T_body_colour = as_pose(T_colour[:3], f"{path}: extrinsics of colour")
     T_body_depth = as_pose(T_depth[:3], f"{path}: extrinsics of depth")

@@ -18,12 +18,13 @@ from hybridvo.io.data import lists
 from hybridvo.io.data.camera_file import parse_camera
 from hybridvo.io.data.image_io import as_pose, image_size, read_depth, read_rgb
 from hybridvo.io.data.resize import resize_camera
-from hybridvo.io.data.sequence import SATURATED, UndistortionMaps, undistort
+from hybridvo.io.data.sequence import UndistortionMaps, in_metres
 from hybridvo.io.data.streams import (
     Images,
     Lens,
     StreamSequence,
     check_lens,
+    straightened,
     units_per_metre,
 )
 
@@ -284,20 +285,14 @@ class TransformsSequence(StreamSequence):
         if view.depth is not None and self._needs_depth:
             depth = self._depth_of(view.depth)
             depth = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        maps = self._lens_maps(index)
-        if maps is None:
-            return Images(rgb, depth)
-        straight, straight_depth, mask = undistort(maps, rgb, depth, None)
-        return Images(straight, straight_depth, mask=mask)
+        return straightened(self._lens_maps(index), rgb, depth)
 
     def _depth_of(self, path: Path) -> np.ndarray:
         """Depth of a frame, (h, w) float32 metres."""
         stored = read_depth(path, self._depth_size)
         if stored.dtype.kind != "u":
             return stored.astype(np.float32)
-        depth = stored.astype(np.float32) / np.float32(self._units)
-        depth[stored == SATURATED] = 0.0
-        return depth
+        return in_metres(stored, self._units)
 
 
 def _focal_length(stated: dict[str, Any], axis: str, length: float) -> float:

@@ -27,7 +27,6 @@ from typing import NamedTuple
 
 from hybridvo.core.errors import InputError
 from hybridvo.io.data.confined.limits import ROSBAGS, is_available
-from hybridvo.io.data.foreign import FILES, ROS_1_BAG, ROS_2_BAG
 
 MAX_REQUEST = 2**16
 """Bytes."""
@@ -42,6 +41,9 @@ CHILD = "hybridvo.io.data.confined.child"
 """The module of what a child does. The process of the run need not import it."""
 BAG_READER = "hybridvo.io.data.bags.reader"
 """The module of the reader of bags, which takes longest to import."""
+BAGS = {".bag", ".mcap", ".db3"}
+OTHERS = {".mp4", ".avi", ".mov", ".m4v", ".webm", ".mkv", ".npz", ".sens", ".r3d"}
+"""Endings of further recordings that a child reads."""
 MAX_LOOKED_AT = 100
 """Files of a folder by whose names it is decided that a child will be needed."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -145,11 +147,10 @@ def prepare(path: Path) -> None:
     with contextlib.suppress(OSError, ValueError):
         inside = path.iterdir() if path.is_dir() else iter([path])
         names = itertools.islice(inside, MAX_LOOKED_AT)
-        kinds = {FILES.get(each.suffix.lower()) for each in names} - {None}
-        if not kinds or not is_available():
+        endings = {each.suffix.lower() for each in names} & (BAGS | OTHERS)
+        if not endings or not is_available():
             return
-        is_bag = not kinds.isdisjoint((ROS_1_BAG, ROS_2_BAG))
-        modules = (BAG_READER, *ROSBAGS) if is_bag else ()
+        modules = (BAG_READER, *ROSBAGS) if endings & BAGS else ()
         server().prepare((CHILD, *modules))
 
 

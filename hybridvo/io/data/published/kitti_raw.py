@@ -8,12 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import read_text
 from hybridvo.core.geometry import invert, make_transform
 from hybridvo.core.types import Camera
 from hybridvo.io.data import lists
 from hybridvo.io.data.camera_file import parse_camera
+from hybridvo.io.data.datasets import labelled_matrix
 from hybridvo.io.data.image_io import as_pose, image_size
 from hybridvo.io.data.stereo import rectified_already
 from hybridvo.io.data.stereo_reader import StereoSequence
@@ -60,8 +61,8 @@ class KittiRawSequence(StereoSequence):
             self.root / "oxts" / "data", r"(\d+)\.txt"
         )
         path = self._calibration_folder / CAMERAS
-        P_left = _matrix(path, f"P_rect_{left_camera}", (3, 4))
-        P_right = _matrix(path, f"P_rect_{right_camera}", (3, 4))
+        P_left = labelled_matrix(path, (f"P_rect_{left_camera}",), (3, 4))
+        P_right = labelled_matrix(path, (f"P_rect_{right_camera}",), (3, 4))
         self._take_cameras(P_left, P_right, path)
         self._take_truth(P_left, numbers)
 
@@ -113,10 +114,8 @@ class KittiRawSequence(StereoSequence):
             found = parse_camera(self._given_camera, size, self.warnings)
             camera = found.camera
         else:
-            try:
+            with format_errors(f"{path}: P_rect"):
                 camera = Camera.from_matrix(P_left[:, :3], *size)
-            except InputError as error:
-                raise FormatError(f"{path}: P_rect: {error}") from None
         if self.root.name.endswith("_extract"):
             self._warn("images of _extract are not rectified: use the _sync folder")
         self._take_rig(rectified_already(camera, baseline, str(path)), size)
@@ -132,7 +131,7 @@ class KittiRawSequence(StereoSequence):
         except FileNotFoundError as error:
             self._warn(f"no ground truth: {Path(error.filename).name} is not there")
             return
-        R_rect = _matrix(folder / CAMERAS, "R_rect_00", (3, 3))
+        R_rect = labelled_matrix(folder / CAMERAS, ("R_rect_00",), (3, 3))
         T_rect_cam0 = make_transform(R_rect, np.zeros(3))
         place = np.linalg.solve(P_left[:, :3], P_left[:, 3])
         T_left_rect = make_transform(np.eye(3), place)
@@ -179,22 +178,6 @@ def _read_oxts(path: Path) -> list[float]:
 
 def _rigid(path: Path) -> np.ndarray:
     """The transform (4, 4) of a file with lines ``R:`` and ``T:``."""
-    R = _matrix(path, "R", (3, 3))
-    t = _matrix(path, "T", (3, 1))
+    R = labelled_matrix(path, ("R",), (3, 3))
+    t = labelled_matrix(path, ("T",), (3, 1))
     return as_pose(np.hstack([R, t]), str(path))
-
-
-def _matrix(path: Path, name: str, shape: tuple[int, int]) -> np.ndarray:
-    """The numbers of a line ``name: 1.0 2.0 ...``."""
-    for line, text in enumerate(read_text(path).split("\n"), start=1):
-        key, _, rest = text.partition(":")
-        if key.strip() != name:
-            continue
-        numbers = np.array([as_number(word) for word in rest.split()])
-        if numbers.size == shape[0] * shape[1] and np.isfinite(numbers).all():
-            return numbers.reshape(shape)
-        expected = f"{shape[0] * shape[1]} numbers of {name}"
-        raise FormatError(
-            f"{path}:{line}: expected {expected}, got {rest.strip()[:80]!r}."
-        )
-    raise FormatError(f"{path}: expected a line '{name}: ...', found none.")

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.files import MAX_YAML_LENGTH, parse_yaml, read_text
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.types import Camera
 from hybridvo.io.data import lists
 from hybridvo.io.data.bags.messages import transform_between
-from hybridvo.io.data.camera_file import DISTORTION_LENGTHS, Calibration
+from hybridvo.io.data.camera_file import (
+    DISTORTION_LENGTHS,
+    Calibration,
+    read_opencv_yaml,
+)
+from hybridvo.io.data.datasets import TumSequence
 from hybridvo.io.data.image_io import as_pose
-from hybridvo.io.data.sequence import Sequence
 
 COLOUR_FRAME = "d400_color_optical_frame"
 BODY_FRAME = "base_link"
@@ -22,7 +24,7 @@ BODY_FRAME = "base_link"
 DEPTH_LIST = "aligned_depth.txt"
 
 
-class OpenLorisSequence(Sequence):
+class OpenLorisSequence(TumSequence):
     """A sequence such as ``office1-1`` in package form: ``color.txt``, ``aligned_depth.txt``.
 
     The camera is in ``sensors.yaml``, and its place on the robot in ``trans_matrix.yaml``.
@@ -30,30 +32,11 @@ class OpenLorisSequence(Sequence):
 
     kind = "openloris"
     depth_scale = 1000.0
-    markers = (("color.txt", DEPTH_LIST),)
+    markers: tuple[tuple[str, ...], ...] = (("color.txt", DEPTH_LIST),)
 
     def _list_files(self) -> None:
-        stamps, rgb_names = self._read_list("color.txt")
-        depth_stamps, depth_names = self._read_list(DEPTH_LIST)
-        where = self.root / "color.txt"
-        pairs = lists.depth_at(stamps, depth_stamps, where, self.warnings)
-        self.timestamps = stamps[[i for i, _ in pairs]]
-        self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
-        self.rgb_files = [self._file(rgb_names[i], "color.txt") for i, _ in pairs]
-        self.depth_files = [
-            self._file(depth_names[j], DEPTH_LIST) for _, j in pairs
-        ]
+        self._match_lists("color.txt", DEPTH_LIST)
         self._take_truth()
-
-    def _read_list(self, name: str) -> tuple[np.ndarray, list[str]]:
-        """Read a list ``timestamp filename``."""
-        stamps, words = lists.read_stamps(
-            self.root / name, self.warnings, "timestamp filename", words=1
-        )
-        return stamps, [row[0] for row in words]
-
-    def _file(self, name: str, listed_in: str) -> Path:
-        return lists.listed_file(self.root, name, self.root / listed_in)
 
     def _take_truth(self) -> None:
         """Take the poses of the robot, brought to the camera."""
@@ -77,7 +60,7 @@ class OpenLorisSequence(Sequence):
         path = self.root / "trans_matrix.yaml"
         if not path.is_file():
             return None
-        content = _read_opencv(path)
+        content = read_opencv_yaml(path)
         entries = content.get("trans_matrix")
         edges: dict[tuple[str, str], np.ndarray] = {}
         for entry in entries if isinstance(entries, list) else []:
@@ -95,7 +78,7 @@ class OpenLorisSequence(Sequence):
                 f"{path}: not there: it holds the camera of {COLOUR_FRAME}; or give "
                 "--camera fx,fy,cx,cy."
             )
-        sensor = _read_opencv(path).get(COLOUR_FRAME)
+        sensor = read_opencv_yaml(path).get(COLOUR_FRAME)
         if not isinstance(sensor, dict):
             raise FormatError(f"{path}: expected '{COLOUR_FRAME}:', found none.")
         # in this order
@@ -111,22 +94,9 @@ class OpenLorisSequence(Sequence):
                 f"{path}: distortion_coefficients: expected 4, 5 or 8 numbers, got "
                 f"{len(distortion)}."
             )
-        try:
+        with format_errors(f"{path}: {COLOUR_FRAME}"):
             size: Any = (sensor.get("height"), sensor.get("width"))
-            camera = Camera(fx, fy, cx, cy, *size)
-        except InputError as error:
-            raise FormatError(f"{path}: {COLOUR_FRAME}: {error}") from None
-        return Calibration(camera, distortion)
-
-
-def _read_opencv(path: Path) -> dict[str, Any]:
-    """Read a YAML file of OpenCV, whose first line and tags are no plain YAML."""
-    text = read_text(path, MAX_YAML_LENGTH).replace("!!opencv-matrix", "")
-    lines = [line for line in text.split("\n") if not line.startswith("%")]
-    content = parse_yaml("\n".join(lines), str(path))
-    if not isinstance(content, dict):
-        raise FormatError(f"{path}: expected 'key: value' lines.")
-    return content
+            return Calibration(Camera(fx, fy, cx, cy, *size), distortion)
 
 
 def _numbers(matrix: Any, count: int | None, where: str) -> np.ndarray:

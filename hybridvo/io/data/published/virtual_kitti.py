@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridvo.core.checks import as_number
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import read_text
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
@@ -83,11 +83,8 @@ class VirtualKittiSequence(Sequence):
         if not rows:
             raise FormatError(f"{path}: expected '{INTRINSIC}', got no row.")
         fx, fy, cx, cy = rows[min(rows)].tolist()
-        try:
-            camera = Camera(fx, fy, cx, cy, self.height, self.width)
-        except InputError as error:
-            raise FormatError(f"{path}: {error}") from None
-        return Calibration(camera)
+        with format_errors(path):
+            return Calibration(Camera(fx, fy, cx, cy, self.height, self.width))
 
     def _read_flow(
         self, path: Path, index: int

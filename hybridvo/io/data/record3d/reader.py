@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.geometry import make_transform
 from hybridvo.core.types import Camera
 from hybridvo.io.data.camera_file import parse_camera
@@ -120,13 +120,11 @@ class Record3dSequence(StreamSequence):
             # column by column: fx 0 0 0 fy 0 cx cy 1
             rows = K.reshape(-1)[None, [0, 4, 6, 7]]
         height, width = self._image_size
-        try:
+        with format_errors(f"{self.root}: metadata: camera"):
             cameras = [
                 Camera(fx, fy, cx, cy, height, width)
                 for fx, fy, cx, cy in rows.tolist()
             ]
-        except InputError as error:
-            raise FormatError(f"{self.root}: metadata: camera: {error}") from None
         return [self._smaller(camera) for camera in cameras]
 
     def _smaller(self, camera: Camera) -> Camera:
