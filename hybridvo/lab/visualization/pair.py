@@ -45,37 +45,12 @@ class TrueMotion(NamedTuple):
     translation: np.ndarray  # (3,) metres
 
 
-def overview_panels(
-    pair: FramePair, motion: RelativePose, moving: np.ndarray
-) -> list[Panel]:
-    """Make the panels that show at a glance what an answer rests on.
-
-    Args:
-        pair: The pair, with flow and the depth of its previous frame.
-        motion: Its estimated motion.
-        moving: (H, W) bool, which pixels move by themselves; they are outlined.
-
-    Returns:
-        Five panels: image, depth, flow, what of it the motion leaves, and the weights of the
-        pixels; fewer where there is no image, or the method has no weights.
-    """
-    flow = np.asarray(pair.flow)
-    longest = longest_flow(flow)
-    own_flow = flow - _ego_flow(pair, motion.T_curr_prev)
-    return [
-        *_image_panel("image", pair.prev.rgb),
-        _depth_panel(pair),
-        flow_panel("flow F", flow, longest),
-        flow_panel("F minus ego flow", own_flow, longest),
-        *_weight_panel(motion, moving),
-    ]
-
-
 def pair_panels(
     pair: FramePair,
     motion: RelativePose,
     T_gt: np.ndarray | None,
     moving: np.ndarray,
+    everything: bool = True,
 ) -> list[Panel]:
     """Make the panels of a pair that need no network.
 
@@ -84,22 +59,24 @@ def pair_panels(
         motion: Its estimated motion.
         T_gt: The true T_curr_prev (4, 4), or None.
         moving: (H, W) bool, which pixels move by themselves; they are outlined.
+        everything: Whether the current image, the ego flow and, if the ground truth is known, its
+            error are shown as well.
 
     Returns:
-        Images, depth, the flow and its parts, the error of the ego flow if the ground truth is
-        known, and the weights if the method has some.
+        Image, depth, flow, what of it the motion leaves, and the weights if the method has some.
     """
     flow = np.asarray(pair.flow)
     ego = _ego_flow(pair, motion.T_curr_prev)
-    panels = _image_panel("previous image", pair.prev.rgb)
-    panels += _image_panel("current image", pair.curr.rgb)
-    panels.append(_depth_panel(pair))
     # The flow and its two parts have one scale.
     longest = longest_flow(flow)
-    panels.append(flow_panel("flow F", flow, longest))
-    panels.append(flow_panel("ego flow", ego, longest))
+    panels = _image_panel("previous image", pair.prev.rgb)
+    if everything:
+        panels += _image_panel("current image", pair.curr.rgb)
+    panels += [_depth_panel(pair), flow_panel("flow F", flow, longest)]
+    if everything:
+        panels.append(flow_panel("ego flow", ego, longest))
     panels.append(flow_panel("F minus ego flow", flow - ego, longest))
-    if T_gt is not None:
+    if everything and T_gt is not None:
         difference = ego - _ego_flow(pair, T_gt)
         error = np.linalg.norm(difference, axis=2)
         panels.append(Panel("error of the ego flow", error, "px"))

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from mpl_toolkits.axes_grid1 import ImageGrid
 
 from hybridvo.core.files import atomic_write
 from hybridvo.flow.colours import flow_colours, high_value, positive_percentile
@@ -20,6 +21,14 @@ OUTLINE_COLOUR = "#4fd1ff"
 LOW_PERCENTILE = 1
 BAR_TICKS = 4
 """Ticks of a logarithmic colour bar."""
+TITLE_INCHES = 0.34
+"""Height of the title of a panel, with the gap above it."""
+MARGIN_INCHES = 0.08
+"""Below the last row."""
+PANEL_SHARE = 0.87
+"""Share of the width of a column that a panel takes; its colour bar takes the rest."""
+UNIT = (0.0, 1.0, 1.0, 0.0)
+"""Left, right, lower and upper end of every panel in its own axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,68 +64,6 @@ class BarRange(NamedTuple):
     high: float
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where the panels of a figure lie, in inches.
-
-    matplotlib's automatic layouts leave gaps between images of a fixed aspect.
-    """
-
-    aspect: float  # width over height of a panel
-    columns: int
-    rows: int
-    column_width: float  # of a panel with its bar
-    heading_height: float
-
-    title_height = 0.26
-
-    @property
-    def gap(self) -> float:
-        return 0.02 * self.column_width
-
-    @property
-    def panel_width(self) -> float:
-        bar_width = 0.11 * self.column_width
-        return self.column_width - bar_width - self.gap
-
-    @property
-    def panel_height(self) -> float:
-        return self.panel_width / self.aspect
-
-    @property
-    def row_height(self) -> float:
-        return self.panel_height + self.title_height + self.gap
-
-    @property
-    def width(self) -> float:
-        return self.columns * self.column_width
-
-    @property
-    def height(self) -> float:
-        return self.rows * self.row_height + self.heading_height
-
-    def left_of(self, k: int) -> float:
-        """Return the left end of a panel."""
-        return k % self.columns * self.column_width + self.gap
-
-    def top_of(self, k: int) -> float:
-        """Return the upper end of a panel, from the top of the figure."""
-        row = k // self.columns
-        return self.heading_height + row * self.row_height + self.title_height
-
-    def axes(self, figure: Figure, left: float, top: float, width: float) -> Any:
-        """Add axes of the height of a panel to the figure."""
-        bottom = top + self.panel_height
-        return figure.add_axes(
-            (
-                left / self.width,
-                1 - bottom / self.height,
-                width / self.width,
-                self.panel_height / self.height,
-            )
-        )
-
-
 def write_panels(
     path: str | Path,
     panels: list[Panel],
@@ -139,72 +86,77 @@ def write_panels(
     Raises:
         OutputError: The file cannot be written.
     """
-    layout = _Layout(
-        aspect=aspect,
-        columns=columns,
-        rows=-(-len(panels) // columns),
-        column_width=inches,
-        heading_height=0.4 if heading else 0.0,
+    rows = -(-len(panels) // columns)
+    heading_height = 0.4 if heading else 0.0
+    row_height = TITLE_INCHES + PANEL_SHARE * inches / aspect
+    height = rows * row_height + heading_height + MARGIN_INCHES
+    figure = Figure(figsize=(columns * inches, height))
+    grid = ImageGrid(
+        figure,
+        # left, bottom, width and height of all
+        (
+            0.02 / columns,
+            MARGIN_INCHES / height,
+            1 - 0.1 / columns,
+            1 - (heading_height + TITLE_INCHES) / height,
+        ),
+        (rows, columns),
+        axes_pad=((1 - PANEL_SHARE - 0.03) * inches, TITLE_INCHES),
+        aspect=False,
+        cbar_mode="each",
+        cbar_size=0.02 * inches,
+        cbar_pad=0.01 * inches,
     )
-    figure = Figure(figsize=(layout.width, layout.height))
-    ranges = _bar_ranges(panels)
-    for k, panel in enumerate(panels):
-        _add_panel(figure, layout, k, panel, ranges[k])
-    x = layout.gap / layout.width
-    y = 1 - layout.title_height / layout.height
-    figure.text(x, y, heading, fontsize=11, parse_math=False)
+    for axes in (*grid, *grid.cbar_axes):
+        axes.set_visible(False)
+    cells = zip(panels, _bar_ranges(panels), grid, grid.cbar_axes, strict=False)
+    for panel, bar_range, axes, bar_axes in cells:
+        _draw_panel(axes, bar_axes, panel, bar_range, inches)
+    y = 1 - TITLE_INCHES / height
+    figure.text(0.02 / columns, y, heading, fontsize=11, parse_math=False)
     with atomic_write(path, "wb") as file:
         figure.savefig(file, format="png")
 
 
-def _add_panel(
-    figure: Figure, layout: _Layout, k: int, panel: Panel, bar_range: BarRange
+def _draw_panel(
+    axes: Any, bar_axes: Any, panel: Panel, bar_range: BarRange, inches: float
 ) -> None:
-    """Draw panel number ``k`` with its title and its colour bar."""
-    left = layout.left_of(k)
-    top = layout.top_of(k)
-    axes = layout.axes(figure, left, top, layout.panel_width)
-    title = panel.title
-    if panel.unit:
-        title += f" [{panel.unit}]"
-    title_size = min(10, 2 + 1.5 * layout.column_width)
-    axes.set_title(title, fontsize=title_size, loc="left", pad=3)
+    """Draw a panel with its title and its colour bar."""
+    axes.set_visible(True)
+    unit = f" [{panel.unit}]" if panel.unit else ""
+    title_size = min(10, 2 + 1.5 * inches)
+    axes.set_title(f"{panel.title}{unit}", fontsize=title_size, loc="left", pad=3)
     axes.set(xticks=[], yticks=[])
     if not panel.is_map:
-        _draw_image(axes, panel, layout.aspect)
+        axes.imshow(
+            panel.values, extent=UNIT, aspect="auto", interpolation="nearest"
+        )
         return
-    drawn = _draw_map(axes, panel, layout.aspect, bar_range)
-    bar_left = left + layout.panel_width + layout.gap / 2
-    bar_axes = layout.axes(figure, bar_left, top, 0.02 * layout.column_width)
-    bar = figure.colorbar(drawn, cax=bar_axes)
+    drawn = _draw_map(axes, panel, bar_range)
+    bar_axes.set_visible(True)
+    bar = axes.figure.colorbar(drawn, cax=bar_axes)
     if panel.log:
         ticks = np.geomspace(*bar_range, BAR_TICKS).tolist()
         bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks], minor=False)
         bar.minorticks_off()
-    label_size = min(7, 1.6 * layout.column_width)
-    bar_axes.tick_params(labelsize=label_size, length=2, pad=1)
+    bar_axes.tick_params(labelsize=min(7, 1.6 * inches), length=2, pad=1)
 
 
-def _draw_image(axes: Any, panel: Panel, aspect: float) -> None:
-    """Draw an image."""
-    extent = (0.0, aspect, 1.0, 0.0)
-    axes.imshow(panel.values, extent=extent, interpolation="nearest")
-
-
-def _draw_map(axes: Any, panel: Panel, aspect: float, bar_range: BarRange) -> Any:
+def _draw_map(axes: Any, panel: Panel, bar_range: BarRange) -> Any:
     """Draw a map and its outline; returns what its colour bar is for."""
     norm_class = LogNorm if panel.log else Normalize
     drawn = axes.imshow(
         panel.values,
         cmap=colormaps[COLOUR_MAP].with_extremes(bad=UNKNOWN_COLOUR),
         norm=norm_class(*bar_range),
-        extent=(0.0, aspect, 1.0, 0.0),
+        extent=UNIT,
+        aspect="auto",
         interpolation="nearest",
     )
     outline = panel.outline
     if outline is not None and outline.any() and not outline.all():
         height, width = outline.shape
-        x = (np.arange(width) + 0.5) * aspect / width
+        x = (np.arange(width) + 0.5) / width
         y = (np.arange(height) + 0.5) / height
         axes.contour(
             x, y, outline, levels=[0.5], colors=OUTLINE_COLOUR, linewidths=0.8

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -16,24 +16,18 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.files import (
-    LOCK,
-    atomic_write,
-    check_name,
-    give_name,
-    locked_folder,
-    make_folder,
-)
+from hybridvo.core.files import check_name, give_name, make_folder, write_lines
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.bags.writer import DEPTH_TOPIC, RGB_TOPIC, BagWriter, Ros
 from hybridvo.io.data.camera_file import CALIBRATION_FILE, CAMERA_FILE
+from hybridvo.io.data.image_io import write_png
 from hybridvo.io.data.sequence import SATURATED, Sequence, undistort
 from hybridvo.io.data.streams import Lens
 
 UNITS = {"folder": 1000.0, "tum": 5000.0, "ros1": 1000.0, "ros2": 1000.0}
 """Stored units of depth in one metre, by layout."""
 Layout = Literal["folder", "tum", "ros1", "ros2"]
-PART_ENDING = ".part"
+PART_ENDING = ".part-"
 """What follows the name of the output in that of the folder where it is written."""
 BAG_ENDING = ".bag"
 """How the file of a bag of ROS 1 ends."""
@@ -63,8 +57,8 @@ def convert(
 
     Distortion is out of the images, and depth that a mask takes away is 0.
 
-    All is written into a folder beside, ``OUT.part``, and gets its name when it is whole. Nothing
-    is left of what fails, and after a kill the same call begins anew.
+    All is written into a folder beside, and gets its name when it is whole. Nothing is left of what
+    fails.
 
     Args:
         sequence: What ``open_sequence`` returns.
@@ -83,7 +77,6 @@ def convert(
 
     Raises:
         InputError: The folder is not empty, a number is of no use, or there is nothing to write.
-        LockedError: It is being written by another process.
         OutputError: A file cannot be written.
     """
     path = Path(out)
@@ -114,43 +107,14 @@ def convert(
 def _written_beside(path: Path, to: Layout) -> Iterator[Path]:
     """Give a name for what is being written, and the right one to what is whole."""
     path = path.resolve()
-    folder = path.with_name(f"{path.name}{PART_ENDING}")
-    if folder.exists():
-        _check_rest(folder, path.name)
-    part = folder / path.name
-    try:
-        with locked_folder(folder):
-            _remove(part)
-            try:
-                # another process may have written it before the folder was locked
-                _check_new(path, to)
-                yield part
-                give_name(part, path)
-            finally:
-                _remove(part)
-    finally:
-        # it is not empty where another process has come
-        with contextlib.suppress(OSError):
-            folder.rmdir()
-
-
-def _check_rest(folder: Path, name: str) -> None:
-    """Raise an InputError where a folder holds more than a conversion that was killed left."""
-    if not folder.is_dir() or {each.name for each in folder.iterdir()} - {
-        LOCK,
-        name,
-    }:
-        raise InputError(
-            f"{folder}: expected no such name, or what an earlier convert left: it would be "
-            "removed. Choose another name for the output."
-        )
-
-
-def _remove(part: Path) -> None:
-    if part.is_dir():
-        shutil.rmtree(part, ignore_errors=True)
-    else:
-        part.unlink(missing_ok=True)
+    make_folder(path.parent)
+    prefix = f"{path.name[:100]}{PART_ENDING}"
+    with TemporaryDirectory(prefix=prefix, dir=path.parent) as folder:
+        part = Path(folder) / path.name
+        yield part
+        # another process may have written it meanwhile
+        _check_new(path, to)
+        give_name(part, path)
 
 
 def _written(
@@ -398,12 +362,8 @@ class _FolderWriter(_Writer):
         self._write_text(name, lines)
 
     def _write_text(self, name: str, lines: list[str]) -> None:
-        with atomic_write(self.path / name) as file:
-            file.write("\n".join(lines) + "\n")
+        write_lines(self.path / name, lines)
 
     def _write_png(self, name: str, image: np.ndarray) -> None:
         path = self.path / name
-        make_folder(path.parent)
-        _, data = cv2.imencode(".png", image)
-        with atomic_write(path, "wb") as file:
-            file.write(data.tobytes())
+        write_png(path, image)

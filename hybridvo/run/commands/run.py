@@ -357,7 +357,7 @@ def restored(value: Any, sequence: Sequence) -> Any:
         }
         return STATE_CLASSES[value["state"]](**fields)
     if "frame" in value:
-        return divided(sequence.frame(value["frame"]), value.get("depth_scale", 1))
+        return divided(sequence.frame(value["frame"]), value["depth_scale"])
     if "packed" in value:
         data = zlib.decompress(base64.b64decode(value["packed"]))
         flat = np.frombuffer(data, dtype=value["dtype"])
@@ -663,7 +663,7 @@ def _warning(row: dict[str, Any]) -> str:
     status = f"{row['status']} ({row['reason']})"
     probability = f"probability {row['probability']:.2f}"
     text = f"frame {row['index']}: {status}, {probability}: {row['message']}"
-    cause = row.get("likely_cause")
+    cause = row["likely_cause"]
     return f"{text} (likely: {cause.replace('_', ' ')})" if cause else text
 
 
@@ -715,8 +715,7 @@ def _summarise(
         for name in TIMES
     }
     outcomes = motions[["status", "reason"]].itertuples(index=False)
-    # a run that an earlier version began has none
-    causes = motions.get("likely_cause", pd.Series(dtype=str)).dropna()
+    causes = motions["likely_cause"].dropna()
     warnings = [*sequence.warnings, *_messages_of_ok(motions)]
     if motions.empty:
         warnings.append("one frame: no motion")
@@ -739,16 +738,9 @@ def _summarise(
         "oracle": _oracles(steps, sequence),
         "depth_scale": _depth_scale(steps),
         **medians,
-        "stages": _stages(tracked),
+        "stages": stage_summary(tracked["stages"]),
         "warnings": warnings,
     }
-
-
-def _stages(motions: pd.DataFrame) -> dict[str, Any]:
-    """Return what the time of the frames went to; of those of an earlier version it is unknown."""
-    if "stages" not in motions:
-        return {}
-    return stage_summary(motions["stages"].dropna())
 
 
 def _least_sure(motions: pd.DataFrame) -> dict[str, Any] | None:

@@ -22,7 +22,6 @@ from hybridvo.lab.evaluation.scores import true_motion
 from hybridvo.lab.visualization.pair import (
     TrueMotion,
     moving_pixels,
-    overview_panels,
     pair_panels,
     prediction_panels,
 )
@@ -76,11 +75,9 @@ def draw_pair(
     flow_gt = sequence.flow(pair)[0] if has_true_flow else None
     motion = estimate(given, method=method, models=models)
     moving = moving_pixels(given, motion, T_gt, flow_gt)
+    panels = pair_panels(given, motion, T_gt, moving, everything)
     if everything:
-        panels = pair_panels(given, motion, T_gt, moving)
         panels += _network_panels(given, models, T_gt, moving)
-    else:
-        panels = overview_panels(given, motion, moving)
     source = given.flow_source
     if given.flow_is_true:
         source += " (true)"

@@ -7,6 +7,7 @@ offset of the clocks.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -109,14 +110,9 @@ def image_motions(sequence: Any, pairs: int) -> tuple[Curve, Curve] | None:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     colour_steps = []
     depth_steps = []
-    prev = complete_frame(sequence, first)
-    for index in range(first + 1, first + count + 1):
-        curr = complete_frame(sequence, index)
-        if prev is None or curr is None:
-            break
+    for prev, curr in itertools.pairwise(middle_frames(sequence, pairs)):
         colour_steps.append(_median_flow(flow, prev.rgb, curr.rgb, _grey))
         depth_steps.append(_median_flow(flow, prev.depth, curr.depth, _nearness))
-        prev = curr
     found = len(colour_steps)
     if found < MIN_CLOCK_PAIRS:
         return None

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
-from hybridvo.core.files import atomic_write, make_folder
+from hybridvo.core.files import make_folder, write_lines
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
 from hybridvo.run.commands.export.views import Points, View
@@ -29,9 +29,9 @@ def write_colmap(folder: Path, views: list[View], points: Points) -> None:
     cameras = {view.camera: 0 for view in views}
     for number, camera in enumerate(cameras, start=1):
         cameras[camera] = number
-    _write(folder / MODEL[0], _camera_lines(views, cameras))
-    _write(folder / MODEL[1], _image_lines(views, cameras))
-    _write(folder / MODEL[2], _point_lines(points))
+    write_lines(folder / MODEL[0], _camera_lines(views, cameras))
+    write_lines(folder / MODEL[1], _image_lines(views, cameras))
+    write_lines(folder / MODEL[2], _point_lines(points))
 
 
 def _camera_lines(views: list[View], cameras: dict[Camera, int]) -> list[str]:
@@ -69,8 +69,3 @@ def _point_lines(points: Points) -> list[str]:
     for number, ((x, y, z), (r, g, b)) in enumerate(rows, start=1):
         lines.append(f"{number} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} 0")
     return lines
-
-
-def _write(path: Path, lines: list[str]) -> None:
-    with atomic_write(path) as file:
-        file.write("\n".join(lines) + "\n")

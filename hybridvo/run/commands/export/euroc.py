@@ -6,7 +6,7 @@ from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
-from hybridvo.core.files import atomic_write
+from hybridvo.core.files import write_lines
 from hybridvo.core.trajectory import Trajectory
 
 HEADER = (
@@ -33,5 +33,4 @@ def write_euroc(path: Path, trajectory: Trajectory) -> None:
     for stamp, place, wxyz in rows:
         values = ",".join(repr(value) for value in (*place, *wxyz))
         lines.append(f"{round(stamp * 10**9)},{values}")
-    with atomic_write(path) as file:
-        file.write("\n".join(lines) + "\n")
+    write_lines(path, lines)

@@ -6,15 +6,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.files import atomic_write, make_folder, remove
+from hybridvo.core.files import make_folder, remove
 from hybridvo.core.results import MovingObject, Step
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.core.types import Frame
-from hybridvo.io.data.image_io import read_mask_png
+from hybridvo.io.data.image_io import read_mask_png, write_png
 from hybridvo.io.data.sequence import Sequence as FrameSequence
 from hybridvo.io.masks import mask_of, numbers_of
 from hybridvo.run.commands.export.colmap import MODEL, write_colmap
@@ -170,16 +169,16 @@ class RunExport:
             return
         bgr = frame.rgb[:, :, ::-1] if frame.rgb.ndim == 3 else frame.rgb
         path = self.folder / IMAGES / _name(frame.index)
-        _write_png(path, np.ascontiguousarray(bgr))
+        write_png(path, np.ascontiguousarray(bgr))
 
     def _write_mask(self, frame: Frame, weights: np.ndarray | None) -> None:
         # 0 where COLMAP ignores a pixel
         image = 255 * mask_of(frame, weights).astype(np.uint8)
-        _write_png(self._mask_path(frame.index), image)
+        write_png(self._mask_path(frame.index), image)
 
     def _write_objects(self, index: int, things: Sequence[MovingObject]) -> None:
         path = self.folder / OBJECTS / _name(index)
-        _write_png(path, numbers_of(things))
+        write_png(path, numbers_of(things))
 
     def _mask_path(self, index: int) -> Path:
         """The mask of an image, by COLMAP's rule: its name with ``.png`` appended."""
@@ -202,10 +201,3 @@ def _files(folder: Path) -> Iterator[Path]:
 
 def _name(index: int) -> str:
     return f"{index:06d}.png"
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    make_folder(path.parent)
-    _, data = cv2.imencode(".png", image)
-    with atomic_write(path, "wb") as file:
-        file.write(data.tobytes())

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridvo.core.files import atomic_write, write_json
+from hybridvo.core.files import write_json, write_lines
 from hybridvo.run.commands.export.views import Points, View
 
 CLOUD = "points.ply"
@@ -78,5 +78,4 @@ def _write_cloud(path: Path, points: Points) -> None:
     rows = zip(points.xyz.tolist(), points.rgb.tolist(), strict=True)
     for (x, y, z), (r, g, b) in rows:
         lines.append(f"{x:.6g} {y:.6g} {z:.6g} {r} {g} {b}")
-    with atomic_write(path) as file:
-        file.write("\n".join(lines) + "\n")
+    write_lines(path, lines)
