@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -28,8 +27,6 @@ from hybridvo.core.files import atomic_write
 
 FORMAT = "hybridvo-network-2"
 """Value of the header's key ``format``."""
-UNSUMMED = "hybridvo-network-1"
-"""The format of files until 0.1.0, which have no checksum."""
 SCALE = ":scale"
 """End of the name of a tensor of scales; before it stands the name of the 8-bit tensor."""
 MAX_INT8 = 127
@@ -46,7 +43,6 @@ PAPER_NAMES = (
     *("vonet", "vonet-attention"),
 )
 """The weights in it."""
-_logger = logging.getLogger(__name__)
 
 
 def save_weights(
@@ -107,8 +103,6 @@ def read_network(
     name_or_path: str | Path, make: Callable[[dict[str, Any]], nn.Module]
 ) -> tuple[nn.Module, dict[str, Any]]:
     """Read a file of :func:`save_weights`.
-
-    A file of the older format, which has no checksum, is read with a warning.
 
     Args:
         name_or_path: the name of pretrained weights, or a file.
@@ -186,7 +180,7 @@ def _parse_header(
     """Options and card of a header."""
     try:
         stated = str(header.get("format"))
-        if stated not in (FORMAT, UNSUMMED):
+        if stated != FORMAT:
             raise ValueError(f"the header's format is {stated[:80]!r}")
         options = dict(json.loads(header["options"]))
         card = dict(json.loads(header["card"]))
@@ -207,14 +201,7 @@ def _unreadable(path: Path, error: Exception) -> CheckpointError:
 def _verify_checksum(
     path: Path, tensors: Mapping[str, torch.Tensor], header: Mapping[str, str]
 ) -> None:
-    """Refuse a file whose checksum is wrong; warn where the format has none."""
-    if header["format"] == UNSUMMED:
-        _logger.warning(
-            "%s: an older weights file without checksum: whether it is damaged cannot "
-            "be detected; save_weights writes it with one.",
-            path,
-        )
-        return
+    """Refuse a file whose checksum is wrong."""
     stated = header.get("checksum", "none")
     computed = checksum(tensors, header)
     if stated != computed:

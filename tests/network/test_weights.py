@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
-import logging
 import os
 import pickle
 import struct
@@ -24,7 +23,6 @@ from hybridvo.network.weights import (
     FORMAT,
     PAPER_NAMES,
     PAPER_PACKAGE,
-    UNSUMMED,
     checksum,
     pretrained,
     save_weights,
@@ -321,11 +319,3 @@ def test_saving_refuses_what_could_not_be_loaded(tmp_path, network):
     with pytest.raises(InputError, match=r"decoder\.out\.bias"):
         save_weights(path, network, CARD)
     assert not path.exists()
-
-
-def test_an_older_file_without_checksum_is_read_with_a_warning(saved, caplog):
-    rewrite(saved, format=UNSUMMED, checksum=None)
-    with caplog.at_level(logging.WARNING):
-        network, card = load_weights(saved)
-    assert card == CARD and network.options == OPTIONS
-    assert "checksum" in caplog.text and saved.name in caplog.text

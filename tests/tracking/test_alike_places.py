@@ -9,7 +9,11 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import invert
-from hybridvo.lab.synthetic.bays import ALIKE, BAY_WIDTH, row_of_bays
+from hybridvo.core.types import Camera
+from hybridvo.lab.synthetic.bodies import draw_texture
+from hybridvo.lab.synthetic.draws import affine, random_rotation
+from hybridvo.lab.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo.lab.synthetic.render import Scene, Solid
 from hybridvo.lab.synthetic.slow_scenes import noisy_image
 
 SIZE = (120, 160)
@@ -18,6 +22,67 @@ ELSEWHERE = -0.05
 """The first bay, before which the tracker has never been."""
 BORDER = 1.5
 """Between the two that are alike: no other view shows this."""
+
+
+BAY_WIDTH = 6.0
+"""Distance from the middle of one bay to that of the next, metres."""
+BAYS = (0, 1, 1, 2)
+"""What the bays show, from left to right: two are alike."""
+ALIKE = (1, 2)
+"""Places of these two in the row."""
+WALL_DISTANCE = 5.0
+"""Of the wall behind a bay from the camera, metres."""
+HALF_HEIGHT = 2.0
+THICKNESS = 0.1
+"""Of walls, metres."""
+THINGS = 9
+"""Solids that stand in a bay."""
+
+
+def row_of_bays(seed: int, positions: np.ndarray, size: tuple[int, int]) -> Scene:
+    """Make the bays, and a camera that looks at the wall from N places along the row, in bays."""
+    height, width = size
+    focal = float(width)
+    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
+    T_world_cam = np.tile(np.eye(4), (len(positions), 1, 1))
+    T_world_cam[:, 0, 3] = BAY_WIDTH * np.asarray(positions)
+    solids = [
+        _moved(solid, BAY_WIDTH * place)
+        for place, kind in enumerate(BAYS)
+        for solid in _bay(np.random.default_rng([seed, kind]), 100 * kind)
+    ]
+    return Scene(camera, T_world_cam, tuple(solids), seed=seed)
+
+
+def _bay(rng: np.random.Generator, pattern: int) -> list[Solid]:
+    """A bay at the origin: wall, floor and ceiling, and what stands in it."""
+    depth = WALL_DISTANCE / 2
+    half_width = BAY_WIDTH / 2
+    slabs = [
+        ((half_width, HALF_HEIGHT, THICKNESS), (0.0, 0.0, WALL_DISTANCE)),
+        ((half_width, THICKNESS, depth), (0.0, HALF_HEIGHT, depth)),
+        ((half_width, THICKNESS, depth), (0.0, -HALF_HEIGHT, depth)),
+    ]
+    solids = [
+        Solid(BOX, affine(half, centre), pattern=pattern + k, **draw_texture(rng))
+        for k, (half, centre) in enumerate(slabs)
+    ]
+    for k in range(len(slabs), len(slabs) + THINGS):
+        shape = (BOX, ELLIPSOID, CYLINDER)[k % 3]
+        half = rng.uniform(0.15, 0.5, 3)
+        # none reaches into the next bay
+        low = np.array([0.7 - half_width, -1.5, 2.5])
+        high = np.array([half_width - 0.7, 1.5, 4.6])
+        A = affine(half, rng.uniform(low, high), random_rotation(rng))
+        solids.append(Solid(shape, A, pattern=pattern + k, **draw_texture(rng)))
+    return solids
+
+
+def _moved(solid: Solid, x: float) -> Solid:
+    """A solid, moved along the row by some metres."""
+    A = solid.A_world_body.copy()
+    A[0, 3] += x
+    return replace(solid, A_world_body=A)
 
 
 class Walk:

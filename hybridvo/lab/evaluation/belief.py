@@ -19,8 +19,6 @@ THREE_SIGMA = 0.9973
 """Fraction of a normal distribution within three standard deviations."""
 PROBABILITY_BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
 """Edges of the bins of a probability: finer where most of them lie."""
-BELIEF_KEYS = ("probability", "sigma_trans", "sigma_rot_deg", "nees")
-"""Columns of ``pairs.csv`` that state how sure a motion is, and how far that is true."""
 
 
 def stated_sigmas(covariance: np.ndarray) -> dict[str, float]:

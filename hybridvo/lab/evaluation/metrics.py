@@ -286,7 +286,7 @@ def rpe_over_a_second(estimate: Trajectory, gt: Trajectory) -> dict[str, Any]:
         errors = rpe(matched, 1.0, "s")
     except DegenerateError as error:
         return {**dict.fromkeys(names), "reasons_s": str(error)}
-    values = (_rms(errors.translation), _rms(errors.rotation_deg))
+    values = (rms(errors.translation), rms(errors.rotation_deg))
     return dict(zip(names, values, strict=True))
 
 
@@ -325,7 +325,7 @@ def _rpe_over_seconds(matched: Match, delta: float) -> RelativeErrors:
     is_pair = last > first
     if not is_pair.any():
         raise DegenerateError(_too_short(count, delta, "s"))
-    return _errors_between(matched, first[is_pair], last[is_pair])
+    return errors_between(matched, first[is_pair], last[is_pair])
 
 
 def _too_short(count: int, delta: float, unit: str) -> str:
@@ -333,7 +333,7 @@ def _too_short(count: int, delta: float, unit: str) -> str:
     return f"not enough poses: of {count} no two are {delta:g} {unit} apart"
 
 
-def _errors_between(
+def errors_between(
     matched: Match, first: np.ndarray, last: np.ndarray
 ) -> RelativeErrors:
     """Compute the errors of the motions between poses, given by their places (K,)."""
@@ -373,7 +373,7 @@ def kitti_drift(
         last = np.searchsorted(distance, distance + length, side="right")
         (first,) = np.nonzero(last < len(gt))
         if len(first):
-            errors = _errors_between(matched, first, last[first])
+            errors = errors_between(matched, first, last[first])
             means.append([error.mean() / length for error in errors])
     if not means:
         reason = f"the true path of {distance[-1]:.4g} m is shorter than {min(lengths):g} m"
@@ -448,8 +448,8 @@ def evaluate(
     def relative() -> dict[str, Any]:
         errors = rpe(matched, delta, delta_unit)
         return {
-            "rpe_trans_rmse": _rms(errors.translation),
-            "rpe_rot_rmse_deg": _rms(errors.rotation_deg),
+            "rpe_trans_rmse": rms(errors.translation),
+            "rpe_rot_rmse_deg": rms(errors.rotation_deg),
         }
 
     def drift() -> dict[str, Any]:
@@ -490,7 +490,7 @@ def _add_figures(
             report["reasons"][name] = str(error)
 
 
-def _rms(errors: np.ndarray) -> float:
+def rms(errors: np.ndarray) -> float:
     """Return the root of the mean square."""
     return float(np.sqrt(np.mean(errors**2)))
 

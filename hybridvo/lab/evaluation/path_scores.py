@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hybridvo.core.errors import DegenerateError, InputError
-from hybridvo.core.geometry import invert, rotation_angle
+from hybridvo.core.geometry import invert
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.data.open import open_sequence
 from hybridvo.lab.evaluation import scores
@@ -19,9 +19,11 @@ from hybridvo.lab.evaluation.metrics import (
     Match,
     RelativeErrors,
     ate,
+    errors_between,
     match,
     missing_library,
     no_match,
+    rms,
     rpe,
 )
 from hybridvo.lab.evaluation.protocols import (
@@ -38,8 +40,6 @@ STILL_M = 1e-6
 """Extent of a true path below which the camera stands still, metres."""
 FIGURES = ("ate", "rpe_t", "rpe_r")
 """Absolute error, and relative errors of translation and rotation (degrees)."""
-ROW_NAMES = ("sequence", "method", "flow_source", "inputs")
-"""What a row of a protocol begins with."""
 
 
 # -- one path ----------------------------------------------------------------------------
@@ -186,8 +186,8 @@ def _aligned_errors(protocol: Protocol, matched: Match) -> dict[str, Any]:
         relative = rpe(scaled, 1.0, "s")
     else:
         relative = rpe(scaled)
-    values["rpe_t"] = _rms(relative.translation)
-    values["rpe_r"] = _rms(relative.rotation_deg)
+    values["rpe_t"] = rms(relative.translation)
+    values["rpe_r"] = rms(relative.rotation_deg)
     return values
 
 
@@ -227,18 +227,8 @@ def inverse_rpe(matched: Match) -> RelativeErrors:
 
     The angle is that of the usual order. The translation differs from it where rotations err.
     """
-    est = invert(matched.est[1:]) @ matched.est[:-1]
-    gt = invert(matched.gt[1:]) @ matched.gt[:-1]
-    error = invert(est) @ gt
-    return RelativeErrors(
-        np.linalg.norm(error[:, :3, 3], axis=1),
-        np.degrees(rotation_angle(error[:, :3, :3])),
-    )
-
-
-def _rms(errors: np.ndarray) -> float:
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.mean(errors**2)))
+    last = np.arange(len(matched.est) - 1)
+    return errors_between(matched, last + 1, last)
 
 
 # -- all sequences of a protocol ---------------------------------------------------------

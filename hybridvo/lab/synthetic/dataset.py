@@ -13,7 +13,7 @@ import functools
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Any, TypeAlias, TypeVar, get_args
 from zipfile import BadZipFile
 
 import numpy as np
@@ -27,7 +27,6 @@ from hybridvo.core.files import (
     read_text,
     write_json,
 )
-from hybridvo.core.options import option_group
 from hybridvo.lab.synthetic.draws import STORED, sample_generator
 from hybridvo.lab.synthetic.paper_samples import PaperOptions, Sample
 from hybridvo.lab.synthetic.training_scenes import DiverseOptions
@@ -170,7 +169,7 @@ def write_samples(
     manifest = {"options": options, "seed": seed, "count": count}
     if not (folder / MANIFEST).exists():
         write_json(folder / MANIFEST, manifest)
-    elif _manifest(folder) != manifest:
+    elif json.loads(read_text(folder / MANIFEST)) != manifest:
         raise InputError(f"{folder}: holds other samples. Choose another folder.")
 
     size = CHUNK if workers.are_elsewhere else 1
@@ -204,19 +203,6 @@ def _write_sample(preset: Preset, seed: int, folder: Path, index: int) -> None:
             np.savez(file, **vars(sample))
 
 
-@functools.cache
-def _manifest(folder: Path) -> dict[str, Any]:
-    """How the samples of a folder were drawn."""
-    try:
-        return dict(json.loads(read_text(folder / MANIFEST)))
-    except FileNotFoundError:
-        raise InputError(
-            f"{folder}: no {MANIFEST}; write samples with hybridvo generate."
-        ) from None
-    except ValueError as error:
-        raise FormatError(f"{folder}: {MANIFEST} is damaged: {error}.") from None
-
-
 def read_sample(folder: str | Path, index: int) -> Sample:
     """Read one sample of a folder that :func:`write_samples` filled.
 
@@ -231,25 +217,6 @@ def read_sample(folder: str | Path, index: int) -> Sample:
         raise FormatError(f"{path}: damaged or absent sample: {error}.") from None
 
 
-@option_group
-class StoredSamples:
-    """The samples of a folder as training data; in a file ``preset: folder``."""
-
-    folder: str
-    preset: Literal["folder"] = "folder"
-
-    def sample(self, rng: np.random.Generator) -> Sample:
-        """Read one of the samples, chosen at random."""
-        count = _manifest(Path(self.folder))["count"]
-        return read_sample(self.folder, int(rng.integers(count)))
-
-    def for_evaluation(self) -> Preset:
-        """Return the generator that drew the samples, which can
-        draw others for evaluation.
-        """
-        return make_preset(_manifest(Path(self.folder))["options"], self.folder)
-
-
-Preset: TypeAlias = PaperOptions | DiverseOptions | StoredSamples
+Preset: TypeAlias = PaperOptions | DiverseOptions
 PRESETS: dict[Any, type[Preset]] = {kind.preset: kind for kind in get_args(Preset)}
 """The classes of presets by the name that a file gives under ``preset``."""

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridvo.core.files import atomic_write, make_folder
+from hybridvo.core.files import make_folder
 from hybridvo.core.geometry import backproject, invert, pixel_grid, project
 from hybridvo.core.types import Camera, Frame
-from hybridvo.io.data.image_io import write_cam, write_dpt, write_flo
+from hybridvo.io.data.image_io import write_cam, write_dpt, write_flo, write_png
 from hybridvo.io.data.resize import resize_camera
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.lab.synthetic.draws import compose
@@ -274,9 +274,8 @@ def write_sintel(scene: Scene, root: str | Path, name: str) -> None:
 
     for index, T_world_cam in enumerate(scene.T_world_cam):
         frame = scene.render(index)
-        with atomic_write(path_of("clean", "png"), "wb") as file:
-            bgr = cv2.cvtColor(np.asarray(frame.rgb), cv2.COLOR_RGB2BGR)
-            file.write(cv2.imencode(".png", bgr)[1].tobytes())
+        bgr = cv2.cvtColor(np.asarray(frame.rgb), cv2.COLOR_RGB2BGR)
+        write_png(path_of("clean", "png"), bgr)
         write_dpt(path_of("depth", "dpt"), np.asarray(frame.depth))
         T_cam_world = invert(T_world_cam)
         write_cam(path_of("camdata_left", "cam"), scene.camera.K, T_cam_world)

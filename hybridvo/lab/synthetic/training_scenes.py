@@ -443,7 +443,6 @@ def scene_pairs(
     height: int,
     width: int,
     images: bool = True,
-    many_objects_fraction: float = 0.25,
 ) -> dict[str, KnownPair]:
     """Draw a scene as pairs by the name of their flow.
 
@@ -452,14 +451,11 @@ def scene_pairs(
         height: rows of the images.
         width: columns of the images.
         images: whether images are rendered and DIS flow is computed.
-        many_objects_fraction: as in :func:`training_scene`.
 
     Returns:
         ``rendered``, with true or noisy flow, and with images also ``dis``.
     """
-    rendered = render_pair(
-        training_scene(rng, height, width, many_objects_fraction), images
-    )
+    rendered = render_pair(training_scene(rng, height, width), images)
     T = rendered.T_curr_prev
     true_depth = rendered.depth
     flow = rendered.flow

@@ -22,7 +22,7 @@ from hybridvo.lab.calibration import (
     RIGHT_FACTOR,
     WRONG_PX,
 )
-from hybridvo.lab.synthetic.dataset import Preset, StoredSamples
+from hybridvo.lab.synthetic.dataset import Preset
 from hybridvo.lab.synthetic.draws import sample_generator
 from hybridvo.lab.synthetic.paper_samples import Sample
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
@@ -97,12 +97,7 @@ def collate(samples: Sequence[Sample]) -> TrainingBatch:
 
 
 def held_out(preset: Preset, seed: int, count: int) -> list[TrainingBatch]:
-    """Batches of the samples 0 to ``count`` - 1 of a seed, which no training uses.
-
-    A folder of samples is for training: its generator draws others.
-    """
-    if isinstance(preset, StoredSamples):
-        preset = preset.for_evaluation()
+    """Batches of the samples 0 to ``count`` - 1 of a seed, which no training uses."""
     samples = [preset.sample(sample_generator(seed, i)) for i in range(count)]
     return [
         collate(samples[first : first + BATCH]) for first in range(0, count, BATCH)

@@ -46,8 +46,6 @@ def test_an_interrupted_call_goes_on_and_other_samples_are_refused(tmp_path):
 
 
 def test_damage_and_nonsense_are_named(tmp_path):
-    with pytest.raises(InputError, match=r"samples\.json"):
-        dataset.StoredSamples(str(tmp_path / "none")).sample(sample_generator(0, 0))
     list(dataset.write_samples(PaperOptions(**SIZE), 2, tmp_path / "a"))
     with pytest.raises(FormatError, match=r"0000002\.npz: damaged or absent"):
         dataset.read_sample(tmp_path / "a", 2)

@@ -5,14 +5,12 @@ import itertools
 import pytest
 import torch
 
-from hybridvo.lab.synthetic.dataset import Mixture, StoredSamples, write_samples
 from hybridvo.lab.synthetic.draws import (
     HELD_OUT,
     STORED,
     TRAINING,
     sample_generator,
 )
-from hybridvo.lab.synthetic.paper_samples import PaperOptions
 from hybridvo.lab.training.paper_task import sample_stream
 
 
@@ -42,11 +40,3 @@ def test_no_training_seed_draws_a_held_out_sample():
         for use in (HELD_OUT, TRAINING, STORED)
     ]
     assert len(set.union(*drawn)) == 3 * 27
-
-
-def test_stored_samples_are_one_stream_for_every_training(tmp_path):
-    list(write_samples(PaperOptions(height=32, width=64), 5, tmp_path))
-    data = Mixture((StoredSamples(str(tmp_path)),), (1.0,))
-    first, again = (flows(sample_stream(data, 3, 0, 4), 2) for _ in range(2))
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-    assert data.presets[0].for_evaluation() == PaperOptions(height=32, width=64)
