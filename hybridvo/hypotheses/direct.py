@@ -18,6 +18,7 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import PhotometricReport, RelativePose
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import have_texture
+from hybridvo.hypotheses.calibration import DIRECT_INFLATION
 from hybridvo.hypotheses.direct_evidence import (
     TINY,
     PointResiduals,
@@ -96,7 +97,7 @@ def direct_start(
     answer = _refined(pair, coarse, planes, options, belief)
     if answer is None or answer.probability < min_probability:
         return None
-    return answer
+    return answer.replace(covariance=DIRECT_INFLATION * answer.covariance)
 
 
 def _as_it_is(
