@@ -56,7 +56,9 @@ recordings 1.0 to 1.3, flow of half its size 1.5 to 12 (36 pairs each)."""
 DEPTH_LEAD = 1.0
 """Mean flow to which the depth maps lead, as a fraction of the motion's own: up to 0.6 of a turning
 Kinect, whose depth is taken at another time than its image; 1 and more where the image is that of
-another time altogether."""
+another time altogether. Of 18 pairs of a Kinect, a D435 and a HoloLens whose second image is the
+first one within a grey level, 18 are wrong and ``ok`` where the depth maps are not asked, and 1
+where they are; of dark images with spots on the lens 16 and none."""
 CLEAR_DEPTH_LEAD = 0.15
 """The same where the depth maps fit each other much better there."""
 DEPTH_LEAD_GAIN = 5.0
@@ -73,6 +75,9 @@ NO_MOTION_PROBABILITY = 0.05
 # Whether images and depth maps contradict a motion.
 
 # -- depth that is rigid and false -------------------------------------------------------
+#
+# Without the doubt of these numbers a rendered house of bare walls (189 frames) goes from 11 to 35
+# cm: the images alone are sure where bare walls leave a direction open, and a doubt asks for flow.
 
 EXACT_SURFACE = 2e-3
 """Relative distance in depth up to which a pixel lies on a surface. Of real walls that fill the
