@@ -22,7 +22,6 @@ from hybridvo.network.hypothesis_kernels import (
     HypothesisReadings,
 )
 from hybridvo.network.hypothesis_readings import read_hypotheses
-from hybridvo.network.inputs import quantiles
 
 SAME_DEPTH = 0.05
 """Largest difference in log depth of two readings of one surface."""
@@ -157,6 +156,18 @@ def stacked_inputs(maps: GridMaps, device: torch.device) -> HypothesisInputs:
             ("owner", "parent", "pose", "flow_noise", "depth_noise"), none
         ),
     )
+
+
+def quantiles(
+    x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]
+) -> torch.Tensor:
+    """Quantiles (len(q), B) of maps (B, h, w) over a mask; 1 where that is empty.
+
+    Every second pixel of both axes is enough for a scale.
+    """
+    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2].flatten(1)
+    found = torch.nanquantile(kept, kept.new_tensor(q), dim=1)
+    return found.nan_to_num(1.0, 1.0, 1.0)
 
 
 def with_no_motion(

@@ -117,18 +117,6 @@ def pinhole(K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return focal, centre
 
 
-def quantiles(
-    x: torch.Tensor, mask: torch.Tensor, q: tuple[float, ...]
-) -> torch.Tensor:
-    """Quantiles (len(q), B) of maps (B, h, w) over a mask; 1 where that is empty.
-
-    Every second pixel of both axes is enough for a scale.
-    """
-    kept = torch.where(mask, x, torch.nan)[..., ::2, ::2].flatten(1)
-    found = torch.nanquantile(kept, kept.new_tensor(q), dim=1)
-    return found.nan_to_num(1.0, 1.0, 1.0)
-
-
 def scaled_intrinsics(
     K: torch.Tensor, scale: float | torch.Tensor, offset: float | torch.Tensor
 ) -> torch.Tensor:

@@ -31,6 +31,7 @@ from hybridvo.solver.kernels import (
     ScoreProducts,
 )
 from hybridvo.solver.newton import (
+    ROUNDED_STEP_STD,
     Linearization,
     NewtonResult,
     State,
@@ -47,7 +48,6 @@ from hybridvo.solver.shared_errors import (
     tile_pulls,
 )
 from hybridvo.solver.status import FitSummary, degeneracy, status_of
-from hybridvo.solver.torch.newton import ROUNDED_STEP_STD
 
 # Length of the Newton step from the coarse grid's solution to that of all pixels of a pair,
 # standard deviations: of 114 real pairs none was longer. Convergence is quadratic: what such a

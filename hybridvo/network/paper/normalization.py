@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import torch
 
-from hybridvo.network.inputs import NetworkInputs, pinhole, quantiles
+from hybridvo.network.hypothesis_inputs import quantiles
+from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.network.paper.layers import NetworkOptions
 
 # The networks were trained with the numbers of this file: a change of one of them needs

@@ -7,11 +7,9 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import torch
 
+from hybridvo.solver.newton import ROUNDED_STEP_STD
 from hybridvo.solver.newton_kernels import DAMPING, MAX_STEP
 
-# Mean motion of the image, standard deviations, below which a step may be rounding: of a batch,
-# where it is not half as long as the shortest before it; of a pair, its only one.
-ROUNDED_STEP_STD = 0.05
 # First steps of a batch with exact derivatives, none of which ends it as rounding.
 FIRST_BATCH_STEPS = 3
 
