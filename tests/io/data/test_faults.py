@@ -133,6 +133,13 @@ def test_damage_names_file_and_line(kind, name, text, line, tmp_path):
         open_sequence(written.path)
 
 
+def test_a_matrix_that_is_no_projection_is_named(tmp_path):
+    written = write.WRITERS["kitti"](tmp_path)
+    (written.path / "calib.txt").write_text("P2: 20 0 4.5 5 0 0 2.5 0 0 0 1 0\n")
+    with pytest.raises(FormatError, match=r"calib\.txt: P2: expected fx 0 cx"):
+        open_sequence(written.path)
+
+
 @pytest.mark.parametrize("kind", write.WRITERS)
 def test_a_broken_frame_names_its_file_and_costs_itself_alone(kind, tmp_path):
     written = write.WRITERS[kind](tmp_path)
