@@ -79,7 +79,6 @@ NOTICED_BY: dict[str, tuple[float, str]] = {
     "KEYFRAME_AGE": (DOWN, "walk_1/hybrid"),
     "KEYFRAME_CORRELATION": (DOWN, "walk_0/hybrid"),
     # covariance
-    "FEW_TILES": (DOWN, "ladder_covered_tiles/classical"),
     "LONG_GROWTH[0]": (UP, "ladder_two_depths/scale"),
     "LONG_GROWTH[1]": (UP, "ladder_two_depths/scale"),
     "ABSORBED": (DOWN, "scenario_moving70/classical"),
@@ -389,15 +388,12 @@ def load_all() -> None:
     import hybridvo
     from hybridvo.tracking.odometry import warm_up
 
-    wanted = ("pipeline", "network", "solver", "hypotheses", "judge")
+    wanted = ("pipeline", "network", "solver", "hypotheses", "judge", "flow")
     for each in pkgutil.walk_packages(hybridvo.__path__, "hybridvo."):
-        part = each.name.split(".")[1]
-        if part in wanted or part in (
-            "flow",
-            "commands",
-            "evaluation",
-            "synthetic",
-        ):
+        _, room, *inner = each.name.split(".")
+        # what the cases of doctor and evaluation measure
+        measures = room in ("lab", "run") and inner[:1] != ["training"]
+        if room in wanted or measures:
             importlib.import_module(each.name)
     warm_up()
 

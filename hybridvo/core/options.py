@@ -174,7 +174,8 @@ class SelectOptions:
     """Which of the motions is the camera's.
 
     Attributes:
-        refits: motions that are fitted again inside their masks.
+        refits: motions that are fitted again inside their masks. With none, four slow walks among
+            large movers end 31, .3, 3.6 and 4.8 cm off instead of .7, 1.0, 1.9 and .9.
         min_probability: probability of being right below which a motion is degraded.
     """
 
