@@ -32,7 +32,8 @@ MAX_TILE_PX = 64
 ROBUST_CURVATURE = 0.6
 
 # Mean motion of the image, standard deviations, below which a step may be rounding: of a batch,
-# where it is not half as long as the shortest before it; of a pair, its only one.
+# where it is not half as long as the shortest before it; of a pair, where it is the one after the
+# last.
 ROUNDED_STEP_STD = 0.05
 # A step that raises the cost is kept all the same where the square of the next one is smaller than
 # this fraction of its own: noise may move the root of the gradient off the minimum.
