@@ -22,7 +22,14 @@ from measuring import OUTSIDE, digits, parser_of, provenance, store
 
 from bench.memory import CLIPS as RECORDINGS
 from bench.memory import LEAST_WRONG_PX, clip_folders
-from hybridvo import Frame, MovingObject, Odometry, Step, open_sequence
+from hybridvo import (
+    Frame,
+    MovingObject,
+    Odometry,
+    Options,
+    Step,
+    open_sequence,
+)
 from hybridvo.core.geometry import (
     backproject,
     invert,
@@ -31,6 +38,7 @@ from hybridvo.core.geometry import (
     se3_log,
     transform_points,
 )
+from hybridvo.core.options import TrackOptions
 from hybridvo.io.masks import object_colour
 from hybridvo.lab.synthetic.render import Scene, Solid
 from hybridvo.lab.synthetic.scenes import make_scene
@@ -43,6 +51,7 @@ from hybridvo.lab.synthetic.slow_scenes import (
 FAMILIES = ("light", "heavy_two", "heavy_ten", "heavy_rigid", "static")
 KINDS = "lateral approach big room rotate tracking bonnet start stop behind".split()
 """Last words of the names of clips: those with one rigid thing."""
+WITH_OBJECTS = Options(track=TrackOptions(objects="auto"))
 SIZE = (240, 320)
 DRAWN_EVERY = 3
 MIN_FRACTION = 0.03
@@ -127,7 +136,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def draw(path: Path, frames: Iterator[Seen]) -> None:
     """Draw some frames of a scene: the image, and each object in its colour with its number."""
-    odometry = Odometry()
+    odometry = Odometry(options=WITH_OBJECTS)
     columns = []
     for k, seen in enumerate(frames):
         step = odometry.track(seen.frame)
@@ -171,7 +180,7 @@ class Counts:
 
     def follow(self, frames: Iterator[Seen]) -> None:
         """Track a sequence."""
-        odometry = Odometry()
+        odometry = Odometry(options=WITH_OBJECTS)
         last: dict[int, int] = {}
         for k, seen in enumerate(frames):
             step = odometry.track(seen.frame)
