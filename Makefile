@@ -19,12 +19,12 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 .PHONY: demo test test-slow test-long test-ros golden golden-quick same-answers walk check format docs tables paper wheel clean
 
 # the kernels are compiled on one core while pip installs the rest on the other
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml hybridvo_lab/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/$(PIP_INSTALL) -c constraints.txt $(KERNELS_NEED)
-	$(BIN)/python -m hybridvo.compiled & \
+	$(BIN)/python -m hybridvo.compiled hybridvo_lab/signatures.json & \
 	$(BIN)/$(PIP_INSTALL) $(TORCH) && \
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,all,cluster]" && wait
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,all,cluster]" -e ./hybridvo_lab && wait
 	touch $(STAMP)
 
 demo: $(STAMP)
@@ -62,13 +62,14 @@ check: $(STAMP)
 	$(BIN)/lint-imports
 	$(BIN)/codespell
 	$(BIN)/deptry hybridvo
+	$(BIN)/deptry --config hybridvo_lab/pyproject.toml hybridvo_lab
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 docs: $(STAMP)
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[docs]"
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[docs]" -e ./hybridvo_lab
 	$(BIN)/mkdocs build --strict -f configs/mkdocs.yml
 
 tables: $(STAMP)  # every published figure at this commit: docs/results/README.md; leave the machine idle

@@ -9,7 +9,7 @@ import numpy as np
 
 import hybridvo as hvo
 from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 CHANGE = np.diag([4e-4] * 3 + [1e-4] * 3)  # of the motion, m^2 and rad^2 a frame
 WHEELS = np.eye(6)[[2, 4]]  # wheels measure the way forward and the turn

@@ -10,12 +10,11 @@ import torch
 
 import hybridvo as hvo
 from hybridvo.core.geometry import ego_flow, invert
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
+from hybridvo_lab.windows.window import refine_window
 
 FRAMES = 4
-EDGES = [
-    (k, k + step) for k in range(FRAMES) for step in (1, 2) if k + step < FRAMES
-]
+EDGES = [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
 
 
 def pairs_of_a_scene(log_scale: np.ndarray) -> hvo.PairBatch:
@@ -43,7 +42,7 @@ def learn(updates: int = 40) -> tuple[float, float]:
     for _ in range(updates):
         depth = batch.depth_prev * correction[prev].exp()[:, None, None]
         scaled = hvo.PairBatch(batch.flow, depth, batch.K_prev, batch.K_curr)
-        window = hvo.refine_window(scaled, EDGES, noise=(0.1, 0.0))
+        window = refine_window(scaled, EDGES, noise=(0.1, 0.0))
         T = window.T_frame_first
         joint = T[curr] @ torch.linalg.inv(T[prev])
         apart = (window.edges.T_curr_prev - joint)[:, :3, 3].norm(dim=1)

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 import hybridvo as hvo
-from hybridvo.lab.synthetic.training_scenes import DiverseOptions
+from hybridvo_lab.synthetic.training_scenes import DiverseOptions
 
 SIZE = (48, 96)  # px
 BEND_PX = 2.0  # standard deviation of the flow's error where the channel is 1

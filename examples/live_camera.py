@@ -15,8 +15,8 @@ from hybridvo.io.cameras.base import LiveCamera
 from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.live import LiveStep, Patience, stream
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 
 SIZE = {"height": 96, "width": 160}
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import nn
 
 import hybridvo as hvo
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 RADIUS = 8  # px, the longest flow that is found
 PATCH = 7  # px, side of the patches that are compared

@@ -11,7 +11,7 @@ from dataclasses import replace
 import gtsam
 
 import hybridvo as hvo
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 
 def between(edge: hvo.Edge, index: int) -> gtsam.BetweenFactorPose3:

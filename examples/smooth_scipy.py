@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_exp, se3_log
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 
 def smooth(

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import cv2
 
-from hybridvo.lab.synthetic.render import write_sintel
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main as hybridvo
+from hybridvo_lab.synthetic.render import write_sintel
+from hybridvo_lab.synthetic.scenes import make_scene
 
 
 def export(recording: Path, out: Path) -> Path:

@@ -16,7 +16,7 @@ import numpy as np
 import hybridvo as hvo
 from hybridvo.io.data.image_io import read_depth
 from hybridvo.io.masks import mask_of
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 ORANGE = np.array([230.0, 159.0, 0.0])
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.core.geometry import to_ros_covariance as to_ros_covariance
     from hybridvo.core.gravity import Gravity as Gravity
     from hybridvo.core.imu import ImuSamples as ImuSamples
+    from hybridvo.core.laboratory import evaluate as evaluate
     from hybridvo.core.options import Options as Options
     from hybridvo.core.results import Edge as Edge
     from hybridvo.core.results import MotionPrior as MotionPrior
@@ -36,8 +37,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.io.data.open import iter_pairs as iter_pairs
     from hybridvo.io.data.open import open_sequence as open_sequence
     from hybridvo.io.data.resize import resize_frame as resize_frame
-    from hybridvo.lab.evaluation.metrics import evaluate as evaluate
-    from hybridvo.lab.refinement.window import refine_window as refine_window
+    from hybridvo.io.example import example_frames as example_frames
     from hybridvo.network.pwvo import PWVO as PWVO
     from hybridvo.network.selection import select as select
     from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
@@ -57,6 +57,7 @@ _HOME = {
             "Edge MotionPrior MovingObject Reason RelativePose State Status Step"
         ),
         "core.imu": "ImuSamples",
+        "core.laboratory": "evaluate",
         "core.gravity": "Gravity",
         "core.options": "Options",
         "core.errors": "InputError",
@@ -68,9 +69,8 @@ _HOME = {
         "api": "estimate refine",
         "io.data.open": "open_sequence iter_pairs",
         "io.data.resize": "resize_frame",
+        "io.example": "example_frames",
         "flow.providers": "FlowField dis_flow",
-        "lab.evaluation.metrics": "evaluate",
-        "lab.refinement.window": "refine_window",
         "tracking.chains": "chain_covariance to_g2o_information",
         "tracking.inertial": "gyro_prior",
         "tracking.passes": "track_in_passes",

@@ -15,9 +15,9 @@ from hybridvo.flow.providers import dis_flow
 from hybridvo.network.models import Models, default_models
 from hybridvo.pipeline import (
     DEFAULT_METHOD,
-    NETWORKS,
     Context,
     check_method,
+    method_of,
     run_method,
 )
 
@@ -58,9 +58,8 @@ def estimate(
 
     Example:
         >>> import hybridvo as hvo
-        >>> from hybridvo.lab.synthetic.scenes import make_scene
-        >>> scene = make_scene("static", 0, height=96, width=128, frames=2)
-        >>> motion = hvo.estimate(scene.render(0), scene.render(1))
+        >>> prev, curr, _ = hvo.example_frames()
+        >>> motion = hvo.estimate(prev, curr)
         >>> print(motion.status)
         ok
         >>> motion.T_curr_prev.shape, motion.covariance.shape
@@ -79,7 +78,7 @@ def estimate(
     check_kind("estimate.models", models, Models, type(None))
     method = check_method(method)
     models = models or default_models(
-        options.run.device if method in NETWORKS else "cpu"
+        options.run.device if method_of(method).networks else "cpu"
     )
     context = Context(options, models, flow, seed)
     return run_method(context.evidence(pair, prior), method, context)
@@ -161,14 +160,10 @@ def refine(
 
     Example:
         >>> import hybridvo as hvo
-        >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
-        >>> pair, truth = make_pair("moving30", 0, 108, 256)
-        >>> motion = hvo.refine(pair)
+        >>> prev, curr, _ = hvo.example_frames()
+        >>> motion = hvo.refine(hvo.FramePair(prev, curr, hvo.dis_flow()(prev, curr).flow))
         >>> print(motion.status)
         ok
-        >>> error_m = np.linalg.norm((motion.T_curr_prev - truth["T_curr_prev"])[:3, 3])
-        >>> bool(error_m < 0.01)
-        True
     """
     options = Options() if options is None else options
     check_kind("refine.options", options, Options)

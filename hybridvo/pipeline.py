@@ -14,13 +14,12 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hybridvo import baselines
+from hybridvo.core import laboratory
 from hybridvo.core.belief import Belief, resized
 from hybridvo.core.errors import InputError, did_you_mean
 from hybridvo.core.options import Options
@@ -52,7 +51,7 @@ from hybridvo.hypotheses.select import (
 from hybridvo.judge.calibration import DIRECT_PROBABILITY, WITHOUT_IMAGES_RIGHT
 from hybridvo.judge.findings import Question
 from hybridvo.judge.verdict import judge
-from hybridvo.network.models import SELECTION, Models, default_models
+from hybridvo.network.models import Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depth_alone import follow_depth
 from hybridvo.solver.depths import compare_depths
@@ -111,11 +110,6 @@ class Found(NamedTuple):
 
     motion: RelativePose
     pair: FramePair
-
-
-Method = Callable[[PairEvidence, Context], Iterator[Found | None]]
-"""Yields an answer after each source of motions, which rests on all sources so far; None where
-there is none yet."""
 
 
 # -- the sources ---------------------------------------------------------------------
@@ -334,72 +328,79 @@ def pwvo(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     yield Found(motion, pair)
 
 
-def network_alone(
-    name: str, evidence: PairEvidence, ctx: Context
-) -> Iterator[Found]:
-    """A network of the paper alone, by the paper's selection."""
-    from hybridvo.network.prediction import estimate_by_network
-
-    pair = evidence.with_flow
-    network = ctx.models.network(name)
-    yield Found(estimate_by_network(pair, SELECTION[name], network), pair)
-
-
-def baseline(name: str, evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
-    """An estimator of another library, from the expected motion where it takes a start."""
-    needs_flow = name not in baselines.WITHOUT_FLOW
-    pair = evidence.with_flow if needs_flow else evidence.pair
-    start = evidence.start
-    if start is None and evidence.expected is not None:
-        start = evidence.expected.T_curr_prev
-    yield Found(baselines.estimate(name, pair, ctx.seed, start=start), pair)
-
-
 def identity(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     """No motion: the floor that every method must beat."""
     yield Found(RelativePose(covariance=identity_covariance()), evidence.pair)
 
 
-def _missing_torch_geometry(method: str) -> str:
-    """Return why a method that is refined in torch cannot run here; empty where it can."""
-    if method not in REFINED_IN_TORCH:
-        return ""
+def _nothing_is_missing() -> str:
+    """Why a method cannot run here: it can."""
+    return ""
+
+
+def _torch_geometry_is_missing() -> str:
+    """Why a method that is refined in torch cannot run here; empty where it can."""
     absent = [name for name in TORCH_GEOMETRY if find_spec(name) is None]
     if not absent:
         return ""
     return f"{absent[0]} is not installed; pip install 'hybridvo[train]'"
 
 
-METHODS: dict[str, Method] = {
-    "hybrid": hybrid,
-    "hybrid-flow": by_flow,
-    "classical": classical,
-    "pwvo-refine": pwvo_refine,
-    "pwvo": pwvo,
-    **{name: partial(network_alone, name) for name in SELECTION},
-    **{name: partial(baseline, name) for name in baselines.METHODS},
-    "identity": identity,
-}
-"""Every method, in the order of the results' tables."""
-REFINED_IN_TORCH = ("pwvo-refine",)
-"""Methods that need the libraries of the extra ``train``."""
+@dataclass(frozen=True)
+class Method:
+    """How a motion is found, by name in :data:`METHODS`.
+
+    Attributes:
+        answers: yields an answer after each source of motions, which rests on all sources so far;
+            None where there is none yet.
+        networks: names of the weights that it uses.
+        on_images: whether its answer is fitted to the two images at the end.
+        is_verified: whether its answers are held against images and depth maps: those of other
+            libraries and of the paper's rows are shown as they are.
+        cheap_rounds: sources whose cost is known beforehand: of ``hybrid`` the images alone, and
+            one flow of theirs or depth alone. Further flow, from sparse matches, may take a second.
+        missing: returns why it cannot run here, and the remedy; empty where it can.
+    """
+
+    answers: Callable[[PairEvidence, Context], Iterator[Found | None]]
+    networks: tuple[str, ...] = ()
+    on_images: bool = False
+    is_verified: bool = True
+    cheap_rounds: int = 1
+    missing: Callable[[], str] = _nothing_is_missing
+
+
 TORCH_GEOMETRY = ("pypose", "kornia")
-"""These libraries, which ``hybridvo.core.torch_geometry`` imports."""
-ON_IMAGES = ("hybrid", "pwvo-refine")
-"""Methods whose answer is fitted to the two images at the end."""
-CHEAP_ROUNDS = {"hybrid": 2}
-"""Sources of a method whose cost is known beforehand: the images alone, and one flow of theirs or
-depth alone; of other methods one. Further flow, from sparse matches, may take a second."""
+"""Libraries of the extra ``train``, which ``hybridvo.core.torch_geometry`` imports."""
+METHODS: dict[str, Method] = {
+    "hybrid": Method(hybrid, ("pwvo",), on_images=True, cheap_rounds=2),
+    "hybrid-flow": Method(by_flow, ("pwvo",)),
+    "classical": Method(classical),
+    "pwvo-refine": Method(
+        pwvo_refine, ("pwvo",), on_images=True, missing=_torch_geometry_is_missing
+    ),
+    "pwvo": Method(pwvo, ("pwvo",)),
+    "identity": Method(identity, is_verified=False),
+}
+"""The methods of this package; hybridvo-lab adds others by entry points."""
+FLOOR = "identity"
+"""The method that every other must beat stands last in tables."""
 EARLIER_NAMES = {"refine": "classical"}
 """Names of methods that still work, and what they are called now."""
-VERIFIED = ("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo")
-"""Methods whose answers are held against images and depth maps: those of other libraries and the
-paper's rows are shown as they are."""
-NETWORKS: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("hybrid", "hybrid-flow", "pwvo-refine", "pwvo"), ("pwvo",)),
-    **{name: (name,) for name in SELECTION},
-}
-"""Names of the weights that a method uses, where it uses any."""
+
+
+def method_names() -> tuple[str, ...]:
+    """The names of all methods, those of hybridvo-lab as well where it is installed."""
+    ours = [name for name in METHODS if name != FLOOR]
+    return (*ours, *laboratory.names_of(laboratory.METHODS), FLOOR)
+
+
+def method_of(name: str) -> Method:
+    """The method of a name of :func:`method_names`."""
+    if name in METHODS:
+        return METHODS[name]
+    found: Method = laboratory.wanted(laboratory.METHODS, name, f"method '{name}'")
+    return found
 
 
 # -- from evidence to an answer ------------------------------------------------------
@@ -428,7 +429,7 @@ def by_first_source(
     """
     started = time.perf_counter()
     try:
-        found = next(METHODS[method](evidence, ctx))
+        found = next(method_of(method).answers(evidence, ctx))
     except StageFailed as error:
         motion = failed(error)
     else:
@@ -457,7 +458,7 @@ def first_sure(
 
     Args:
         pairs: in the order of preference.
-        method: one of :data:`METHODS`.
+        method: one of :func:`method_names`.
         ctx: options, networks and flow.
         deadline: on the clock of ``time.perf_counter``. After it nothing more is tried once there
             is a motion, and no flow from sparse matches even where there is none. None: there is
@@ -535,8 +536,9 @@ class _Rounds:
     ) -> None:
         self.last: dict[int, Found] = {}
         self._pairs = pairs
-        self._answers = [METHODS[method](evidence, ctx) for evidence in pairs]
-        self._cheap_rounds = CHEAP_ROUNDS.get(method, 1)
+        asked = method_of(method)
+        self._answers = [asked.answers(evidence, ctx) for evidence in pairs]
+        self._cheap_rounds = asked.cheap_rounds
         self._deadline = deadline
 
     def __iter__(self) -> Iterator[tuple[int, Found]]:
@@ -585,7 +587,7 @@ def finished(
         late: whether its time is over: what only improves it is left out.
     """
     motion = found.motion
-    if method in ON_IMAGES and not late:
+    if method_of(method).on_images and not late:
         motion = on_images(found, evidence.options)
     question = Question(
         evidence.pair,
@@ -594,7 +596,7 @@ def finished(
         evidence.provider,
         evidence.options.refine,
     )
-    return judge(question, is_compared=method in VERIFIED)
+    return judge(question, is_compared=method_of(method).is_verified)
 
 
 @stage("solve")
@@ -632,16 +634,18 @@ def check_method(method: str) -> str:
             "the method %s is called %s now", method, EARLIER_NAMES[method]
         )
         method = EARLIER_NAMES[method]
-    if method not in METHODS:
-        hint = did_you_mean(method, METHODS, similarity=0.4)
+    known = method_names()
+    if method not in known:
+        hint = did_you_mean(method, known, similarity=0.4)
         raise InputError(
-            f"method: '{method}' is unknown{hint}; known: {', '.join(METHODS)}."
+            f"method: '{method}' is unknown{hint}; known: {', '.join(known)}"
+            f"{laboratory.more_with_it()}."
         )
-    if NETWORKS.get(method) and find_spec("torch") is None:
+    asked = method_of(method)
+    if asked.networks and find_spec("torch") is None:
         raise InputError(
             f"method '{method}' cannot run here: torch is not installed."
         )
-    reason = baselines.missing(method) or _missing_torch_geometry(method)
-    if reason:
+    if reason := asked.missing():
         raise InputError(f"method '{method}' cannot run here: {reason}.")
     return method

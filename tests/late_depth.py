@@ -8,8 +8,8 @@ import numpy as np
 
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.types import Frame
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 PERIOD_S = 1 / 30
 """Time between two frames."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import hybridvo as hvo
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.slow_scenes import (
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.slow_scenes import (
     noisy_image,
     slow_scene,
     structured_light,

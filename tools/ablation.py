@@ -33,20 +33,20 @@ from measuring import parser_of, provenance
 
 from hybridvo.core.errors import HybridVOError, InputError
 from hybridvo.core.files import write_json
-from hybridvo.lab.synthetic.dataset import load_preset, read_yaml
-from hybridvo.lab.training.options import load_paper_options
-from hybridvo.lab.training.paper_task import PaperTask
-from hybridvo.lab.training.trainer import Trainer
-from hybridvo.lab.training.validation import (
+from hybridvo.network.selection import SELECTION_METHODS
+from hybridvo.network.weights import save_weights
+from hybridvo.run.commands.stopping import StopRequest, stop_requested
+from hybridvo_lab.synthetic.dataset import load_preset, read_yaml
+from hybridvo_lab.training.options import load_paper_options
+from hybridvo_lab.training.paper_task import PaperTask
+from hybridvo_lab.training.trainer import Trainer
+from hybridvo_lab.training.validation import (
     FIGURES,
     PUBLISHED_SEED,
     TrainingBatch,
     evaluate_network,
     held_out,
 )
-from hybridvo.network.selection import SELECTION_METHODS
-from hybridvo.network.weights import save_weights
-from hybridvo.run.commands.stopping import StopRequest, stop_requested
 
 ROWS = Path(__file__).resolve().parents[1] / "configs" / "ablation"
 """Folder with a file for each row."""

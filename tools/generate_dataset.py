@@ -21,8 +21,8 @@ from measuring import add_workers, workers_of
 
 from hybridvo.core.errors import HybridVOError, InputError
 from hybridvo.core.files import make_folder, read_text, write_json
-from hybridvo.lab.synthetic.render import write_sintel
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import write_sintel
+from hybridvo_lab.synthetic.scenes import make_scene
 
 
 class Wanted(NamedTuple):

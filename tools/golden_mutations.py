@@ -28,8 +28,9 @@ COVARIANCE_FACTOR = 4.0
 UP = 4.0 / 3.0
 DOWN = 2.0 / 3.0
 ROOMS = (
-    *("core", "flow", "solver", "judge", "hypotheses", "evidence"),
-    *("baselines", "tracking", "io", "lab", "run"),
+    *("hybridvo.core", "hybridvo.flow", "hybridvo.solver", "hybridvo.judge"),
+    *("hybridvo.hypotheses", "hybridvo.evidence", "hybridvo.tracking"),
+    *("hybridvo.io", "hybridvo.run", "hybridvo_lab", "hybridvo_lab.baselines"),
 )
 """Rooms with numbers that decide."""
 OPTION_DEFAULTS = {"MIN_PROBABILITY": ("select", "min_probability")}
@@ -230,7 +231,7 @@ def calibrated() -> dict[str, Any]:
     """Return the constants of the ``calibration.py`` of every room."""
     found: dict[str, Any] = {}
     for room in ROOMS:
-        module = importlib.import_module(f"hybridvo.{room}.calibration")
+        module = importlib.import_module(f"{room}.calibration")
         found |= {
             name: value for name, value in vars(module).items() if name.isupper()
         }
@@ -340,7 +341,7 @@ def own_modules() -> list[Any]:
     return [
         module
         for name, module in list(sys.modules.items())
-        if name.split(".")[0] == "hybridvo" and module is not None
+        if name.split(".")[0] in ("hybridvo", "hybridvo_lab") and module is not None
     ]
 
 
@@ -386,15 +387,18 @@ def load_all() -> None:
     import pkgutil
 
     import hybridvo
+    import hybridvo_lab
     from hybridvo.tracking.odometry import warm_up
 
-    wanted = ("pipeline", "network", "solver", "hypotheses", "judge", "flow")
-    for each in pkgutil.walk_packages(hybridvo.__path__, "hybridvo."):
-        _, room, *inner = each.name.split(".")
-        # what the cases of doctor and evaluation measure
-        measures = room in ("lab", "run") and inner[:1] != ["training"]
-        if room in wanted or measures:
-            importlib.import_module(each.name)
+    # what finds motions, and what the cases of doctor and evaluation measure
+    wanted = ("pipeline", "network", "solver", "hypotheses", "judge", "flow", "run")
+    for package in (hybridvo, hybridvo_lab):
+        name = package.__name__
+        for each in pkgutil.walk_packages(package.__path__, f"{name}."):
+            room = each.name.split(".")[1]
+            is_of_lab = package is hybridvo_lab and room != "training"
+            if room in wanted or is_of_lab:
+                importlib.import_module(each.name)
     warm_up()
 
 

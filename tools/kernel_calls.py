@@ -61,9 +61,9 @@ def decode() -> None:
 # --- what was compiled ----------------------------------------------------------------------------
 
 
-def modules() -> Iterator[Any]:
-    """The modules of the package that can be imported here."""
-    for found in pkgutil.walk_packages(hybridvo.__path__, "hybridvo."):
+def modules(package: Any) -> Iterator[Any]:
+    """The modules of a package that can be imported here."""
+    for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
         if found.name.endswith("__main__"):
             continue
         try:
@@ -73,11 +73,11 @@ def modules() -> Iterator[Any]:
             continue
 
 
-def kernels() -> dict[str, Dispatcher]:
-    """All kernels of the package, by module and variable: ``module:name``."""
+def kernels(package: Any = hybridvo) -> dict[str, Dispatcher]:
+    """All kernels of a package, by module and variable: ``module:name``."""
     found: dict[int, str] = {}
     by_name = {}
-    for module in modules():
+    for module in modules(package):
         for variable, value in vars(module).items():
             if not (isinstance(value, Dispatcher) and hasattr(value, "_cache")):
                 continue
@@ -101,14 +101,14 @@ def never_called() -> list[str]:
     return sorted(names)
 
 
-def signatures() -> Table:
-    """The types for which each kernel was compiled, or loaded, in this process."""
+def signatures(package: Any) -> Table:
+    """The types for which each kernel of a package was compiled, or loaded, in this process."""
     return {
         name: [
             [describe_type(argument) for argument in signature]
             for signature in kernel.overloads
         ]
-        for name, kernel in kernels().items()
+        for name, kernel in kernels(package).items()
         if kernel.overloads
     }
 
@@ -146,12 +146,17 @@ def main(argv: list[str] | None = None) -> int:
     what.add_argument(
         "--signatures",
         action="store_true",
-        help="write the table of hybridvo.compiled.ahead_of_time instead",
+        help="write the tables for hybridvo.compiled.ahead_of_time instead",
     )
     args = parser.parse_args(argv)
     if args.signatures:
+        import hybridvo_lab
+        from hybridvo_lab.commands.demo import demo_frames
+
         call_all()
-        write_table(signatures())
+        demo_frames(1)
+        write_table(signatures(hybridvo))
+        write_table(signatures(hybridvo_lab), hybridvo_lab.KERNELS)
         return 0
     compile_ahead()
     call_all()

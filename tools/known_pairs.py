@@ -66,8 +66,8 @@ def heavy(kind: str) -> Iterator[Case]:
 
 def rendered(kind: str, seed: int, size: tuple[int, int], frames: int) -> Any:
     """A rendered scene as a sequence."""
-    from hybridvo.lab.synthetic.render import SyntheticSequence
-    from hybridvo.lab.synthetic.scenes import make_scene
+    from hybridvo_lab.synthetic.render import SyntheticSequence
+    from hybridvo_lab.synthetic.scenes import make_scene
 
     height, width = size
     return SyntheticSequence(
@@ -121,7 +121,7 @@ def real(data: Path, name: str) -> Iterator[Case]:
 
 def degenerate(kind: str) -> Iterator[Case]:
     """Four pairs, two of them without noise, in which the motion is weak or not determined."""
-    from hybridvo.lab.synthetic.noise_scenarios import (
+    from hybridvo_lab.synthetic.noise_scenarios import (
         SCENARIOS,
         Scenario,
         make_pair,

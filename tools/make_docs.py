@@ -25,9 +25,9 @@ from measuring import ROOT, parser_of
 from paper import ROWS
 
 from hybridvo.core.calibration import MIN_PROBABILITY
-from hybridvo.lab.evaluation.protocols import protocols
-from hybridvo.lab.evaluation.report import number
 from hybridvo.network.selection import SELECTION_METHODS
+from hybridvo_lab.evaluation.protocols import protocols
+from hybridvo_lab.evaluation.report import number
 
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 """A part of a page that is filled: its first line, name, content and last line."""

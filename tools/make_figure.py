@@ -27,8 +27,8 @@ from scipy.spatial.transform import Rotation
 from hybridvo import Camera, Frame, Odometry, open_sequence
 from hybridvo.core.geometry import invert
 from hybridvo.flow.providers import dis_flow
-from hybridvo.lab.synthetic.raycast import BOX, ELLIPSOID
-from hybridvo.lab.synthetic.render import Scene, Solid
+from hybridvo_lab.synthetic.raycast import BOX, ELLIPSOID
+from hybridvo_lab.synthetic.render import Scene, Solid
 
 BLUE = "#0072B2"
 ORANGE = "#D55E00"

@@ -22,12 +22,12 @@ from hybridvo.core.geometry import backproject, invert
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.providers import with_flow
 from hybridvo.io.data.sequence import Sequence
-from hybridvo.lab.synthetic.blurred_turns import Recorded, draw_blurred_turn
-from hybridvo.lab.synthetic.paper_samples import KnownPair
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.scenes import HEAVY, make_scene
-from hybridvo.lab.synthetic.semi_real import load_split
-from hybridvo.lab.synthetic.turned_windows import (
+from hybridvo_lab.synthetic.blurred_turns import Recorded, draw_blurred_turn
+from hybridvo_lab.synthetic.paper_samples import KnownPair
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.scenes import HEAVY, make_scene
+from hybridvo_lab.synthetic.semi_real import load_split
+from hybridvo_lab.synthetic.turned_windows import (
     TripodRecording,
     draw_turned_window,
     load_tripod,

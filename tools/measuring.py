@@ -22,12 +22,12 @@ from scipy.stats import binomtest
 
 from hybridvo import Odometry, Options, pipeline
 from hybridvo.core import geometry
-from hybridvo.core.cluster import Workers
 from hybridvo.core.errors import FormatError
 from hybridvo.core.files import Journal, make_folder
 from hybridvo.core.geometry import se3_log
 from hybridvo.core.options import TrackOptions
-from hybridvo.lab.calibration import WRONG_PX
+from hybridvo_lab.calibration import WRONG_PX
+from hybridvo_lab.cluster import Workers
 
 ROOT = Path(__file__).resolve().parents[1]
 """The repository."""
@@ -239,9 +239,10 @@ class Methods(NamedTuple):
 
 def methods_here(wanted: Iterable[str]) -> Methods:
     """Sort methods by whether they can run here."""
-    from hybridvo.run.commands.compare import methods_to_run
+    from hybridvo.run.commands.ready_methods import methods_to_run
+    from hybridvo_lab.methods import in_order
 
-    ready, missing = methods_to_run(("all",))
+    ready, missing = methods_to_run(("all",), every=in_order())
     names = list(wanted)
     return Methods(
         [name for name in names if name in ready],

@@ -2,8 +2,8 @@
 ``tools/ablation.py`` trained.
 
     python tools/paper.py --ablation runs/ablation            # figures, docs/results/paper.json
-    python tools/paper.py --ablation runs/ablation --install  # and put the rows into hybridvo_paper
-    python tools/paper.py --cards   # score the rows in hybridvo_paper anew, for their cards
+    python tools/paper.py --ablation runs/ablation --install  # and keep the weights
+    python tools/paper.py --cards   # score the rows of hybridvo_lab/weights anew
 
 Draws the five steps of the data workflow, the saliency of VONet and PWVO
 (integrated gradients), the uncertainty beside the error and the objects' flow,
@@ -31,21 +31,6 @@ from safetensors.torch import save
 
 from hybridvo.core.files import atomic_write, write_json
 from hybridvo.flow.colours import longest_flow
-from hybridvo.lab.synthetic.dataset import load_preset, make_preset
-from hybridvo.lab.synthetic.draws import sample_generator
-from hybridvo.lab.training.validation import (
-    PUBLISHED_SEED,
-    collate,
-    evaluate_network,
-    held_out,
-)
-from hybridvo.lab.visualization.pair import prediction_panels
-from hybridvo.lab.visualization.panels import (
-    Panel,
-    flow_panel,
-    write_panels,
-)
-from hybridvo.lab.visualization.saliency import network_saliencies, saliency_panels
 from hybridvo.network.models import load_weights
 from hybridvo.network.selection import select_motion
 from hybridvo.network.weights import (
@@ -53,9 +38,24 @@ from hybridvo.network.weights import (
     save_weights,
     weights_file,
 )
-from hybridvo.run.commands.train import write_sheet
+from hybridvo_lab.commands.train import write_sheet
+from hybridvo_lab.synthetic.dataset import load_preset, make_preset
+from hybridvo_lab.synthetic.draws import sample_generator
+from hybridvo_lab.training.validation import (
+    PUBLISHED_SEED,
+    collate,
+    evaluate_network,
+    held_out,
+)
+from hybridvo_lab.visualization.pair import prediction_panels
+from hybridvo_lab.visualization.panels import (
+    Panel,
+    flow_panel,
+    write_panels,
+)
+from hybridvo_lab.visualization.saliency import network_saliencies, saliency_panels
 
-PAPER_WEIGHTS = ROOT / "hybridvo_paper"
+PAPER_WEIGHTS = ROOT / "hybridvo_lab" / "weights"
 """The package of the rows' weights."""
 ROWS = {
     "vonet": "VONet",
@@ -155,7 +155,7 @@ def build_parser() -> argparse.ArgumentParser:
     add(
         "--install",
         action="store_true",
-        help="copy the rows' weights into hybridvo_paper",
+        help="copy the rows' weights into hybridvo_lab/weights",
     )
     add(
         "--cards",
@@ -166,7 +166,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def install(name: str, path: Path) -> None:
-    """Put a row into ``hybridvo_paper``.
+    """Put a row into ``hybridvo_lab/weights``.
 
     There it reads every second pixel of the usual 128x256 inputs.
     """
@@ -184,7 +184,7 @@ def install(name: str, path: Path) -> None:
 
 
 def score_cards(argv: list[str] | None) -> None:
-    """Write the figures of the rows in ``hybridvo_paper`` into their cards.
+    """Write the figures of the rows in ``hybridvo_lab/weights`` into their cards.
 
     Only on the paper's data, which stay as they are. The scenes of the diverse data change
     with the package, and figures on them grow old in a file.

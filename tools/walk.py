@@ -25,7 +25,7 @@ from measuring import parser_of
 
 import hybridvo
 from hybridvo import Frame, Odometry
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 PACKAGE = Path(hybridvo.__file__).parent
 FAMILIES = ("static", "heavy_two", "heavy_rigid")

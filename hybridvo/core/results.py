@@ -599,3 +599,20 @@ def stated_stds(covariance: np.ndarray) -> tuple[float, float]:
     """
     variances = np.maximum(np.diag(covariance), 0.0)
     return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:].sum()))
+
+
+def stated_sigmas(covariance: np.ndarray) -> dict[str, float]:
+    """Return the standard deviations of a motion as lengths of its two halves.
+
+    Args:
+        covariance: (6, 6) m^2, m rad, rad^2, translation first.
+
+    Returns:
+        ``sigma_trans``, metres, and ``sigma_rot_deg``, degrees.
+
+    Example:
+        >>> stated_sigmas(np.diag([0.01, 0.01, 0.02, 0, 0, 0]))["sigma_trans"]
+        0.2
+    """
+    std_m, std_rad = stated_stds(covariance)
+    return {"sigma_trans": std_m, "sigma_rot_deg": float(np.degrees(std_rad))}

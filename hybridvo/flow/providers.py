@@ -113,11 +113,11 @@ def dis_flow(preset: str = "medium") -> FlowProvider:
     Raises:
         InputError: the preset is unknown.
 
-    >>> from hybridvo.lab.synthetic.scenes import make_scene
-    >>> scene = make_scene("static", 0, height=60, width=80, frames=2)
-    >>> field = dis_flow()(scene.render(0), scene.render(1))
+    >>> import hybridvo as hvo
+    >>> prev, curr, _ = hvo.example_frames()
+    >>> field = dis_flow()(prev, curr)
     >>> field.flow.shape, field.source
-    ((60, 80, 2), 'dis')
+    ((120, 160, 2), 'dis')
     """
     if preset not in DIS_PRESETS:
         raise InputError(
@@ -191,8 +191,8 @@ def has_texture(frame: Frame) -> bool:
     Args:
         frame: any; without an image it has no texture.
 
-    >>> from hybridvo.lab.synthetic.scenes import make_scene
-    >>> seen = make_scene("static", 0, height=60, width=80, frames=2).render(0)
+    >>> import hybridvo as hvo
+    >>> seen = hvo.example_frames()[0]
     >>> has_texture(seen), has_texture(replace(seen, rgb=0 * seen.rgb))
     (True, False)
     """

@@ -4,7 +4,7 @@ The probabilities of being right are logistic in their evidence (for PWVO the ma
 best score and that of another motion): weights, and one that stands alone. ``python
 tools/calibrate.py`` fits them on the makers of ``tools/maker_pairs.py`` that are for calibration,
 each with the same weight: clips and tripod recordings of others, the development recordings of
-``hybridvo.lab.synthetic.semi_real``, heavy scenes and an escalator, and scenes without an
+``hybridvo_lab.synthetic.semi_real``, heavy scenes and an escalator, and scenes without an
 answer.
 Where "the same pairs" are named, they are 1000 of the development recordings, the heavy scenes of
 seeds 900 to 905 with DIS flow, and 100 scenes without an answer.

@@ -9,17 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from hybridvo.core import laboratory
 from hybridvo.core.errors import CheckpointError, InputError
 
 PWVO_KIND = "pwvo-hypotheses"
 """``kind`` in the options of our PWVO; the paper's is ``pwvo``."""
-AVERAGED = ("pwvo-uncertain", "pwvo-naive", "pixelwise", "vonet", "vonet-attention")
-"""Methods whose motion is the mean over all pixels."""
-SELECTION = {
-    "pwvo-paper": "softmax",
-    **dict.fromkeys(AVERAGED, "mean"),
-}
-"""Methods that are a network of the paper alone, and how one motion is selected from its pixels."""
 
 
 def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
@@ -42,9 +36,10 @@ def load_weights(name_or_path: str | Path) -> tuple[Any, dict[str, Any]]:
             from hybridvo.network.pwvo import PWVO, PWVOOptions
 
             return PWVO(PWVOOptions(**options))
-        from hybridvo.network.paper.networks import NetworkOptions, build_network
-
-        return build_network(NetworkOptions(**options))
+        build = laboratory.wanted(
+            laboratory.FUNCTIONS, "network_of_options", f"{name_or_path}"
+        )
+        return build(options)
 
     return read_network(name_or_path, make)
 
@@ -111,6 +106,13 @@ class Models:
                 f"{path}: expected the weights of a {name}, got a {kind}'s."
             )
         return network.to(self.device, memory_format=torch.channels_last)
+
+
+def network_names() -> tuple[str, ...]:
+    """Names of the networks whose weights may be given."""
+    papers = laboratory.find(laboratory.FUNCTIONS, "weights")
+    files = [] if papers is None else papers.glob("*.safetensors")
+    return ("pwvo", *sorted(file.stem for file in files))
 
 
 def _kind_of(name: str) -> str:

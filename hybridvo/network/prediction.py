@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.special import expit
-from torch import nn
 
 from hybridvo.core.euler import euler_transform
 from hybridvo.core.options import Options
@@ -61,10 +60,10 @@ def estimate_by_pwvo(
     Raises:
         StageFailed: if flow, depth or usable pixels are missing.
     """
-    _check_usable(pair)
+    usable_inputs(pair)
     with single_threaded_inference():
         maps = predict_pairs(network, [pair], [prior], options, seed)
-    found = _selected(maps, "softmax")
+    found = selected_motion(maps, "softmax")
     assert maps.lead is not None
     probability = float(expit(float(maps.lead[0])))
     if found.ok and probability < options.select.min_probability:
@@ -74,7 +73,7 @@ def estimate_by_pwvo(
     return found.replace(probability=probability)
 
 
-def _check_usable(pair: FramePair) -> NetworkInputs:
+def usable_inputs(pair: FramePair) -> NetworkInputs:
     """The inputs of the paper's networks; fails where a pair has too little of them."""
     if pair.flow is None:
         raise StageFailed(Reason.NO_FLOW, "no optical flow for this pair")
@@ -88,29 +87,7 @@ def _check_usable(pair: FramePair) -> NetworkInputs:
     return inputs
 
 
-def estimate_by_network(
-    pair: FramePair, selection: str, network: nn.Module
-) -> RelativePose:
-    """Estimate the camera motion of a pair by a network alone.
-
-    Args:
-        pair: frames with flow, and depth of the previous one.
-        selection: a method of :func:`hybridvo.network.selection.select_pose`.
-        network: any network of the paper.
-
-    Returns:
-        The motion, with the covariance 2 U^2 of the Laplace scales U that the network
-        predicts.
-
-    Raises:
-        StageFailed: if flow, depth or usable pixels are missing.
-    """
-    inputs = _check_usable(pair).to(next(network.parameters()).device)
-    with single_threaded_inference():
-        return _selected(network(inputs), selection)
-
-
-def _selected(maps: PixelwisePrediction, selection: str) -> RelativePose:
+def selected_motion(maps: PixelwisePrediction, selection: str) -> RelativePose:
     """The selected motion of the maps of one pair, with the scales selected as it is."""
     pose = select_pose(maps, selection).double()
     T = euler_transform(pose)[0].cpu().numpy()

@@ -92,11 +92,11 @@ class PWVO(nn.Module):
 
     Example:
         >>> import hybridvo as hvo
-        >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
-        >>> pair, _ = make_pair("moving30", 0, 108, 256)
+        >>> prev, curr, _ = hvo.example_frames()
+        >>> pair = hvo.FramePair(prev, curr, hvo.dis_flow()(prev, curr).flow)
         >>> maps = hvo.PWVO.from_pretrained()(pair)
         >>> maps.motion.shape  # a pose for each pixel of the search's grid
-        torch.Size([1, 6, 54, 128])
+        torch.Size([1, 6, 60, 80])
         >>> hvo.select(maps).T_curr_prev.shape
         torch.Size([1, 4, 4])
     """

@@ -12,7 +12,6 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
+from hybridvo.core import laboratory
 from hybridvo.core.checks import brief
 from hybridvo.core.errors import CheckpointError, InputError
 from hybridvo.core.files import atomic_write
@@ -36,13 +36,6 @@ NAMES_SHOWN = 6
 """Tensors that an error message names."""
 PRETRAINED = Path(__file__).parent / "pretrained"
 """The folder of the network that the methods use."""
-PAPER_PACKAGE = "hybridvo_paper"
-"""The package of the paper's weights, which is installed by itself."""
-PAPER_NAMES = (
-    *("pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise"),
-    *("vonet", "vonet-attention"),
-)
-"""The weights in it."""
 
 
 def save_weights(
@@ -259,9 +252,9 @@ def _not_finite(tensors: Mapping[str, torch.Tensor]) -> str:
 def pretrained() -> dict[str, Path]:
     """Name -> file, of all pretrained weights that are installed."""
     folders = [PRETRAINED]
-    package = find_spec(PAPER_PACKAGE)
-    if package is not None:
-        folders += map(Path, package.submodule_search_locations or ())
+    papers = laboratory.find(laboratory.FUNCTIONS, "weights")
+    if papers is not None:
+        folders.append(papers)
     files = [path for folder in folders for path in folder.glob("*.safetensors")]
     return {path.stem: path for path in files}
 
@@ -279,10 +272,7 @@ def weights_file(name_or_path: str | Path) -> Path:
     if is_path and os.path.isfile(path):
         return Path(path)
     name = path if is_path else brief(path)
-    if name in PAPER_NAMES:
-        raise CheckpointError(
-            f"{name}: the weights of the paper's networks are not installed: pip install "
-            "hybridvo-paper; in a clone of hybridvo: pip install ./hybridvo_paper."
-        )
     names = ", ".join(sorted(known))
-    raise CheckpointError(f"{name}: no such weights. Pretrained: {names}.")
+    raise CheckpointError(
+        f"{name}: no such weights. Pretrained: {names}{laboratory.more_with_it()}."
+    )

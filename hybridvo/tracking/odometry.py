@@ -66,10 +66,8 @@ class Odometry:
 
     Example:
         >>> import hybridvo as hvo
-        >>> from hybridvo.lab.synthetic.scenes import make_scene
-        >>> scene = make_scene("static", 0, height=96, width=128, frames=3)
         >>> vo = hvo.Odometry(network=None)
-        >>> steps = [vo.track(scene.render(i)) for i in range(3)]
+        >>> steps = [vo.track(frame) for frame in hvo.example_frames()]
         >>> [(step.prev_index, str(step.status)) for step in steps]
         [(None, 'ok'), (0, 'ok'), (1, 'ok')]
     """
@@ -92,7 +90,7 @@ class Odometry:
         default = "classical" if network is None else pipeline.DEFAULT_METHOD
         self.method = pipeline.check_method(method or default)
         self.seed = as_seed(seed, "Odometry.seed")
-        needs_network = self.method in pipeline.NETWORKS
+        needs_network = bool(pipeline.method_of(self.method).networks)
         device = self.options.run.device if needs_network else "cpu"
         if network is None and needs_network:
             raise InputError(

@@ -117,10 +117,8 @@ def track_in_passes(
             two of one index, and for a tracker that is not new.
 
     Example:
-        >>> from hybridvo.lab.synthetic.scenes import make_scene
-        >>> scene = make_scene("static", 0, height=96, width=128, frames=3)
-        >>> frames = [scene.render(i) for i in range(3)]
-        >>> tracked = track_in_passes(frames, passes=2)
+        >>> import hybridvo as hvo
+        >>> tracked = track_in_passes(hvo.example_frames(), passes=2)
         >>> len(tracked.steps), tracked.times.readout_ms
         (3, 0.0)
     """

@@ -290,7 +290,7 @@ class Pairs:
         What rests on depth alone has it already, as what was expected.
         """
         gyroscope = self.query.gyroscope
-        is_ours = self.setup.method in pipeline.VERIFIED
+        is_ours = pipeline.method_of(self.setup.method).is_verified
         is_found = motion.usable and not motion.is_by_depth_alone
         if gyroscope is None or not (is_ours and is_found):
             return motion

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from hybridvo.api import estimate
-from hybridvo.baselines import WITHOUT_FLOW
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import MotionPrior, Reason, State
 from hybridvo.core.types import FramePair
 from hybridvo.hypotheses.generate import without_sky
-from hybridvo.lab.synthetic.noise_scenarios import make_pair
-from hybridvo.pipeline import DEFAULT_METHOD, METHODS, check_method
+from hybridvo.pipeline import DEFAULT_METHOD, check_method, method_names
+from hybridvo_lab.baselines import WITHOUT_FLOW
+from hybridvo_lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 
 SEARCHING = ("hybrid", "hybrid-flow", "classical")
@@ -52,7 +52,7 @@ def runs_here(method: str) -> bool:
     return True
 
 
-HERE = [method for method in METHODS if runs_here(method)]
+HERE = [method for method in method_names() if runs_here(method)]
 
 
 def of_methods(

@@ -35,7 +35,7 @@ def has_examples(tree: ast.Module) -> bool:
 
 MODULES = [
     source.module_name(path)
-    for path, tree in source.files().items()
+    for path, tree in source.files_of_both().items()
     if has_examples(tree)
 ]
 

@@ -7,8 +7,8 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core import stages
 from hybridvo.core.stages import STAGES, stage, stage_times
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.commands.diagnosis.speed import measure
+from hybridvo_lab.synthetic.scenes import make_scene
 
 
 class Clock:

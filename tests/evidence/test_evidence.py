@@ -18,9 +18,9 @@ from hybridvo.core.options import TrackOptions
 from hybridvo.core.results import MotionPrior, Reason, RelativePose
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests import worlds
 
 SIZE = {"height": 96, "width": 224}
@@ -52,7 +52,7 @@ def priors_of(
 ) -> list[MotionPrior | None]:
     """The priors of frame 1, of frame 2, and of frame 4, before which one was lost."""
     recorder = Recorder()
-    monkeypatch.setitem(pipeline.METHODS, "identity", recorder)
+    monkeypatch.setitem(pipeline.METHODS, "identity", pipeline.Method(recorder))
     options = hybridvo.Options(track=TrackOptions(motion_prior=motion_prior))
     vo = hybridvo.Odometry(method="identity", options=options)
     camera = Camera(60, 60, 31.5, 23.5, 48, 64)

@@ -13,7 +13,7 @@ from hybridvo.evidence.one_time import (
     pair_at_image_times,
 )
 from hybridvo.flow.providers import with_flow
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests import worlds
 
 SIZE = (120, 160)

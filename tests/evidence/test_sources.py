@@ -12,9 +12,9 @@ from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.pipeline import Context, Found, by_first_source, first_sure
 from hybridvo.tracking.odometry import Odometry
+from hybridvo_lab.synthetic.scenes import make_scene
 
 STEP = se3_exp(np.array([0.005, 0, 0, 0, 0, 0]))
 DOUBTFUL = Status.degraded(Reason.AMBIGUOUS_MOTION, "by hand")
@@ -47,9 +47,9 @@ class Asked:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
     method = Asked()
-    monkeypatch.setitem(pipeline.METHODS, "classical", method)
     # images and flow
-    monkeypatch.setitem(pipeline.CHEAP_ROUNDS, "classical", 2)
+    asked = pipeline.Method(method, cheap_rounds=2)
+    monkeypatch.setitem(pipeline.METHODS, "classical", asked)
     return method
 
 
@@ -107,7 +107,7 @@ def test_what_a_later_source_says_replaces_what_an_earlier_one_said(
         yield Found(surer, evidence.pair)
         yield Found(last, evidence.pair)
 
-    monkeypatch.setitem(pipeline.METHODS, "identity", method)
+    monkeypatch.setitem(pipeline.METHODS, "identity", pipeline.Method(method))
     answer = first_sure([evidence_of_a_pair()], "identity", Context())
     assert answer.motion.probability == 0.3
 
@@ -117,7 +117,7 @@ def test_a_stage_that_fails_becomes_a_status(monkeypatch: pytest.MonkeyPatch):
         raise StageFailed(Reason.NO_FLOW, "by hand")
         yield
 
-    monkeypatch.setitem(pipeline.METHODS, "identity", method)
+    monkeypatch.setitem(pipeline.METHODS, "identity", pipeline.Method(method))
     answer = first_sure([evidence_of_a_pair()], "identity", Context())
     assert not answer.motion.usable
     assert answer.motion.status.reason is Reason.NO_FLOW

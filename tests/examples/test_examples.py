@@ -19,8 +19,8 @@ from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.results import Reason, RelativePose, Status
 from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.live import Patience
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests.scripts import ROOT, load_script
 
 EXAMPLES = ROOT / "examples"

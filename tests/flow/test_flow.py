@@ -17,8 +17,8 @@ from hybridvo.flow.providers import (
     forward_backward_check,
     with_flow,
 )
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 
 HEIGHT, WIDTH = 96, 128
 BASE, FACTOR = DIS_NOISE

@@ -19,12 +19,12 @@ from hybridvo.hypotheses.direct_evidence import (
 )
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.choice import direct_evidence, direct_probability
-from hybridvo.lab.synthetic.slow_scenes import (
+from hybridvo.solver.planes import PlaneFactor
+from hybridvo_lab.synthetic.slow_scenes import (
     noisy_image,
     slow_scene,
     structured_light,
 )
-from hybridvo.solver.planes import PlaneFactor
 
 SIZE = (240, 320)
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, *SIZE)

@@ -15,8 +15,8 @@ from hybridvo.hypotheses.matches import (
     match_features,
     matched_motions,
 )
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 
 class Turned:

@@ -27,8 +27,8 @@ from hybridvo.hypotheses.select import (
 )
 from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.judge.choice import choice_probability
-from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.solver.refine_flow import Selection, refine_pair
+from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}

@@ -16,7 +16,7 @@ from hybridvo.judge.consistency import (
     contradiction_by_depth,
 )
 from hybridvo.judge.findings import Finding, Question
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 METHODS = ["hybrid", "hybrid-flow", "classical", "pwvo-refine"]
 

@@ -12,7 +12,7 @@ import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_exp
 from hybridvo.core.results import Reason
 from hybridvo.judge.false_depth import exact_surface
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 
 CAMERA = hvo.Camera(250.0, 250.0, 159.5, 119.5, 240, 320)
 

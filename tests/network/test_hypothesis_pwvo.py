@@ -18,7 +18,6 @@ from hybridvo.core.options import Options
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.types import HypothesisSet
-from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.network.grid_maps import GridMaps, grid_maps
 from hybridvo.network.hypothesis_inputs import (
     RESIDUAL_QUANTILE,
@@ -32,6 +31,7 @@ from hybridvo.network.hypothesis_kernels import HypothesisReadings
 from hybridvo.network.hypothesis_maps import FirstLook
 from hybridvo.network.hypothesis_readings import read_hypotheses
 from hybridvo.network.pwvo import MAX_CORRECTION, PWVO, PWVOOptions
+from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 
 CELL = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = {"height": 96, "width": 224}

@@ -11,8 +11,8 @@ from hybridvo.core.euler import euler_transform
 from hybridvo.core.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import Camera
-from hybridvo.network.paper.losses import LossOptions, LossTargets, total_loss
 from hybridvo.network.selection import select_pose
+from hybridvo_lab.paper.losses import LossOptions, LossTargets, total_loss
 
 PLAIN = {
     "pose_uncertainty": False,

@@ -13,9 +13,9 @@ from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import Camera, PairBatch
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.paper.losses import LossOptions, LossTargets, total_loss
-from hybridvo.network.paper.networks import NetworkOptions, build_network
-from hybridvo.network.paper.normalization import normalize
+from hybridvo_lab.paper.losses import LossOptions, LossTargets, total_loss
+from hybridvo_lab.paper.networks import NetworkOptions, build_network
+from hybridvo_lab.paper.normalization import normalize
 
 CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
 SCALE_FREE = NetworkOptions(scale_free=True)

@@ -14,10 +14,10 @@ from hybridvo.core.options import Options, SelectOptions
 from hybridvo.core.results import MotionPrior, StageFailed
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
-from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.network.pair_maps import look_at_pair, predict_pairs
 from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selection import INVALID_LOG_SCALE, select
+from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 from tests import worlds
 
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)

@@ -10,9 +10,9 @@ import torch
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import PairBatch
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.paper.layers import SelfAttention
-from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.network.selection import INVALID_LOG_SCALE
+from hybridvo_lab.paper.layers import SelfAttention
+from hybridvo_lab.paper.networks import NetworkOptions, build_network
 
 TINY = NetworkOptions(width=0.125)
 

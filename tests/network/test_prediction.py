@@ -11,13 +11,14 @@ from hybridvo.core.geometry import ego_flow, rotation_angle, se3_exp
 from hybridvo.core.options import Options, SelectOptions
 from hybridvo.core.results import PixelwisePrediction, Reason, StageFailed, State
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.network.inputs import assemble_inputs
-from hybridvo.network.paper.networks import NetworkOptions, build_network
-from hybridvo.network.paper.weighted_fit import fitted_motion
-from hybridvo.network.prediction import estimate_by_network, estimate_by_pwvo
+from hybridvo.network.prediction import estimate_by_pwvo
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.selection import select_motion
+from hybridvo_lab.paper.networks import NetworkOptions, build_network
+from hybridvo_lab.paper.prediction import estimate_by_network
+from hybridvo_lab.paper.weighted_fit import fitted_motion
+from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 
 STRIDE = 4
 

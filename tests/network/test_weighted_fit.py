@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from hybridvo.core.geometry import rotation_angle, se3_exp
 from hybridvo.core.torch_geometry import se3
-from hybridvo.network.paper.weighted_fit import MIN_FIT_SCALE, pixel_weights
 from hybridvo.solver.torch.factors import Pixels, fit_pixels
+from hybridvo_lab.paper.weighted_fit import MIN_FIT_SCALE, pixel_weights
 
 COUNT = 600
 

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 import os
 import pickle
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from hybridvo.core import laboratory
 from hybridvo.core.errors import CheckpointError, InputError, OutputError
 from hybridvo.network.models import Models, load_weights
-from hybridvo.network.paper.networks import NetworkOptions, build_network
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.weights import (
     FORMAT,
-    PAPER_NAMES,
-    PAPER_PACKAGE,
     checksum,
     pretrained,
     save_weights,
     weights_file,
 )
-from hybridvo.run.commands.compare import methods_to_run
+from hybridvo.pipeline import check_method
+from hybridvo.run.commands.ready_methods import methods_to_run
+from hybridvo_lab import WEIGHTS
+from hybridvo_lab.methods import SELECTION
+from hybridvo_lab.paper.networks import NetworkOptions, build_network
 
 OPTIONS = NetworkOptions(width=0.125)
 CARD = {"preset": "paper", "samples": 12, "figures": {"r_err_deg": 0.1}}
@@ -239,7 +239,7 @@ def test_damaged_options_and_cards(saved, text):
 
 def test_pretrained_weights_load_and_are_small():
     names = list(pretrained())
-    assert set(names) == {"pwvo", *PAPER_NAMES}
+    assert set(names) == {"pwvo", *SELECTION}
     for name in names:
         network, card = load_weights(name)
         kind = "pwvo" if name == "pixelwise" else name.split("-")[0]
@@ -258,18 +258,18 @@ def test_pretrained_weights_load_and_are_small():
 def test_the_papers_weights_are_a_package_of_their_own(monkeypatch):
     import hybridvo.network.weights as module
 
-    found = importlib.util.find_spec(PAPER_PACKAGE)
-    assert weights_file("vonet").parent == Path(found.origin).parent
+    assert weights_file("vonet").parent == WEIGHTS
     assert weights_file("pwvo").parent == module.PRETRAINED
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(laboratory, "_points", lambda group: {})
     assert list(pretrained()) == ["pwvo"]
-    remedy = "pip install hybridvo-paper; in a clone of hybridvo: pip install ./hyb"
+    remedy = "pip install hybridvo-lab; in a clone of hybridvo: pip install ./hyb"
     with pytest.raises(CheckpointError, match=f"^vonet: .*{remedy}"):
         weights_file("vonet")
     ready, missing = methods_to_run(("all",))
-    assert {"hybrid", "pwvo"} <= set(ready)
-    assert set(PAPER_NAMES) <= set(missing)
-    assert "pip install hybridvo-paper" in missing["pixelwise"]
+    assert {"hybrid", "pwvo", "identity"} <= set(ready)
+    assert "pnp-ransac" not in {*ready, *missing}
+    with pytest.raises(InputError, match=remedy):
+        check_method("pnp-ransac")
 
 
 def test_a_method_refuses_the_weights_of_another_network(saved):

@@ -22,6 +22,18 @@ def files() -> dict[str, ast.Module]:
 
 
 @cache
+def files_of_both() -> dict[str, ast.Module]:
+    """The same, and of hybridvo-lab, whose paths begin with ``hybridvo_lab/``."""
+    laboratory = {
+        path.relative_to(ROOT).as_posix(): ast.parse(
+            path.read_text(encoding="utf-8")
+        )
+        for path in sorted((ROOT / "hybridvo_lab").rglob("*.py"))
+    }
+    return files() | laboratory
+
+
+@cache
 def imported(tree: ast.AST) -> frozenset[str]:
     """Dotted names of all that a source imports, inside functions as well."""
     names: set[str] = set()
@@ -35,7 +47,8 @@ def imported(tree: ast.AST) -> frozenset[str]:
 
 def module_name(path: str) -> str:
     """``hybridvo.io.data.open`` of ``io/data/open.py``."""
-    parts = ["hybridvo", *path.removesuffix(".py").split("/")]
+    below = [] if path.startswith("hybridvo_lab/") else ["hybridvo"]
+    parts = [*below, *path.removesuffix(".py").split("/")]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 

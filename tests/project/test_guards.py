@@ -46,7 +46,8 @@ def unsafe_loads(tree: ast.AST) -> Iterator[str]:
 
 def test_no_file_of_weights_or_arrays_can_run_code() -> None:
     found = {
-        path: list(unsafe_loads(tree)) for path, tree in source.files().items()
+        path: list(unsafe_loads(tree))
+        for path, tree in source.files_of_both().items()
     }
     assert not {path: lines for path, lines in found.items() if lines}
 
@@ -57,7 +58,7 @@ the viewer that he asks for listens."""
 
 
 def test_the_library_uses_no_network() -> None:
-    for path, tree in source.files().items():
+    for path, tree in source.files_of_both().items():
         if path in SENDS:
             continue
         assert (
@@ -69,7 +70,7 @@ def test_no_assert_checks_what_a_user_gave() -> None:
     """Assertions vanish under ``python -O``; those that narrow a type for mypy may stay."""
     found = [
         f"{path}:{node.lineno}"
-        for path, tree in source.files().items()
+        for path, tree in source.files_of_both().items()
         for node in ast.walk(tree)
         if isinstance(node, ast.Assert)
         and "is not None" not in (text := ast.unparse(node.test))
@@ -135,6 +136,6 @@ def test_no_file_is_large() -> None:
 def test_the_parts_of_evo_that_act_on_import_are_never_used() -> None:
     # evo.tools.settings writes into the home folder, evo.tools.plot sets a backend
     acting = ("evo.tools.settings", "evo.tools.plot", "evo.main")
-    for path, tree in source.files().items():
+    for path, tree in source.files_of_both().items():
         for name in source.imported(tree):
             assert not name.startswith(acting), path

@@ -19,7 +19,7 @@ def test_a_name_of_the_calibrations_is_given_once() -> None:
     """A second one would change what the first decides, wherever it is used."""
     count = Counter(
         name
-        for path, tree in source.files().items()
+        for path, tree in source.files_of_both().items()
         if path.endswith("/calibration.py")
         for name in source.constants(tree)
     )
@@ -97,8 +97,12 @@ def state():
     ]
 numba.get_num_threads()  # starts numba's threads, which changes what torch says
 before = state()
-import hybridvo
-names = [m.name for m in pkgutil.walk_packages(hybridvo.__path__, "hybridvo.")]
+import hybridvo, hybridvo_lab
+names = [
+    m.name
+    for package in (hybridvo, hybridvo_lab)
+    for m in pkgutil.walk_packages(package.__path__, package.__name__ + ".")
+]
 modules = [importlib.import_module(name) for name in names]
 after = state()
 print(json.dumps([len(names), [i for i, (a, b) in enumerate(zip(before, after)) if a != b]]))

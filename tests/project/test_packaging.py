@@ -174,7 +174,7 @@ def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
     )
     (path,) = tmp_path.iterdir()
     assert path.name == f"hybridvo-{hybridvo.__version__}-py3-none-any.whl"
-    # the networks of the paper are a package of their own
+    # the laboratory is a distribution of its own
     assert path.stat().st_size < 3_000_000
     with zipfile.ZipFile(path) as wheel:
         names = set(wheel.namelist())
@@ -183,7 +183,7 @@ def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
         entry_points = wheel.read(info.replace("METADATA", "entry_points.txt"))
     tops = {name.partition("/")[0] for name in names}
     assert tops == {"hybridvo", f"hybridvo-{hybridvo.__version__}.dist-info"}
-    for folder in ("network/pretrained", "lab/evaluation/templates"):
+    for folder in ("network/pretrained", "io/example"):
         own = (ROOT / "hybridvo" / folder).rglob("*.*")
         assert {f"hybridvo/{folder}/{x.name}" for x in own} <= names
     presets = (ROOT / "configs/cameras").glob("*.yaml")
@@ -198,29 +198,30 @@ def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_papers_weights_are_built_by_themselves(tmp_path: Path) -> None:
+def test_the_laboratory_is_built_by_itself(tmp_path: Path) -> None:
     pytest.importorskip("hatchling")
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel"]
-    folder = ROOT / "hybridvo_paper"
+    folder = ROOT / "hybridvo_lab"
     subprocess.run(
         [*build, "-d", str(tmp_path)], cwd=folder, check=True, capture_output=True
     )
     (path,) = tmp_path.iterdir()
     with zipfile.ZipFile(path) as wheel:
         names = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    kinds = (".py", ".json", ".safetensors", ".yaml", ".md", ".html")
     files = {
-        x.name for x in folder.glob("*.*") if x.suffix in (".json", ".safetensors")
+        x.relative_to(ROOT).as_posix()
+        for x in folder.rglob("*.*")
+        if x.suffix in kinds and x.name != "README.md"
     }
-    assert names == {f"hybridvo_paper/{name}" for name in {"__init__.py", *files}}
+    assert names == files
 
 
 TRACK = """
 import json
 import hybridvo
-from hybridvo.lab.synthetic.scenes import make_scene
-scene = make_scene("light", 0, height=218, width=512, frames=4)
 tracker = hybridvo.Odometry()
-steps = [tracker.track(scene.render(index)) for index in range(4)]
+steps = [tracker.track(frame) for frame in hybridvo.example_frames()]
 print(json.dumps([hybridvo.__file__, [step.T_world_cam.tolist() for step in steps]]))
 """
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hybridvo.lab.synthetic.render import write_sintel
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import write_sintel
+from hybridvo_lab.synthetic.scenes import make_scene
 
 FRAMES = 6
 

@@ -14,10 +14,11 @@ from hybridvo.run import cli
 from hybridvo.run.cli import main
 from hybridvo.run.commands import live as live_command
 from hybridvo.run.commands import run as run_command
-from hybridvo.run.commands import show, terminal
+from hybridvo.run.commands import terminal
 from hybridvo.run.commands.arguments import build_parser
 from hybridvo.run.commands.next_step import command_that_shows
 from hybridvo.run.commands.run import _least_sure
+from hybridvo_lab.commands import show
 from tests.io.live.scripted import ScriptedCamera, reading
 
 

@@ -15,6 +15,7 @@ import filelock
 import numpy as np
 import pytest
 
+from hybridvo.core import laboratory
 from hybridvo.core.errors import printable
 from hybridvo.core.files import LOCK
 from hybridvo.core.options import RunOptions, option_defaults
@@ -322,15 +323,15 @@ CALLED = {
         "hybridvo.io.cameras.choose:choose_camera",
     ],
     "evaluate": [
-        "hybridvo.lab.evaluation.metrics:evaluate",
-        "hybridvo.lab.evaluation.path_scores:evaluate_path",
+        "hybridvo_lab.evaluation.metrics:evaluate",
+        "hybridvo_lab.evaluation.path_scores:evaluate_path",
     ],
     "doctor": [
         "hybridvo.run.commands.doctor:diagnose",
         "hybridvo.run.commands.doctor:diagnose_camera",
     ],
-    "pwvo": ["hybridvo.run.commands.train:train_network"],
-    "paper": ["hybridvo.run.commands.train:train_network"],
+    "pwvo": ["hybridvo_lab.commands.train:train_network"],
+    "paper": ["hybridvo_lab.commands.train:train_network"],
 }
 """What the commands call that are more than a call."""
 PREPARED = {"weights", "jobs", "cluster", "config", "assignments", "flow", "speed"}
@@ -346,7 +347,12 @@ def test_every_argument_is_taken(command):
     places = CALLED.get(command.name) or command.call.args
     for place in (*places, "hybridvo.io.data.open:open_sequence"):
         module, _, name = place.partition(":")
-        taken |= set(signature(getattr(import_module(module), name)).parameters)
+        function = (
+            getattr(import_module(module), name)
+            if name
+            else laboratory.find(laboratory.COMMANDS, place)
+        )
+        taken |= set(signature(function).parameters)
     for part in command.arguments:
         for names, settings in getattr(part, "arguments", [part]):
             name = settings.get("dest", names[0].lstrip("-").replace("-", "_"))

@@ -17,16 +17,16 @@ from hybridvo.core.options import FlowOptions, Options, RunOptions
 from hybridvo.core.results import RelativePose
 from hybridvo.core.trajectory import read_trajectory
 from hybridvo.io.data.open import open_sequence
-from hybridvo.lab.evaluation.scores import PAIR_COLUMNS
-from hybridvo.lab.synthetic.render import write_sintel
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.network.models import Models
-from hybridvo.pipeline import METHODS
+from hybridvo.pipeline import METHODS, Method, method_names
 from hybridvo.run.cli import main
-from hybridvo.run.commands.compare import WRITTEN, compare, methods_to_run, open_all
 from hybridvo.run.commands.run_folder import weights_hash
 from hybridvo.run.commands.text import text_of
 from hybridvo.tracking.odometry import Odometry
+from hybridvo_lab.commands.compare import WRITTEN, compare, methods_to_run, open_all
+from hybridvo_lab.evaluation.scores import PAIR_COLUMNS
+from hybridvo_lab.synthetic.render import write_sintel
+from hybridvo_lab.synthetic.scenes import make_scene
 
 ROWS = set(
     "sequence method flow_source depth_source pairs failed r_err_deg t_err epe epe_l2_px "
@@ -250,7 +250,7 @@ def broken(pair: Any, context: Any) -> RelativePose:
 def test_a_bug_of_a_method_costs_its_run(
     tiny: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setitem(METHODS, "pnp-ransac", broken)
+    monkeypatch.setitem(METHODS, "pnp-ransac", Method(broken))
     run(tiny, out=tmp_path / "out", flow="file")
     result = json.loads((tmp_path / "out" / "results.json").read_text())
     assert result["missing"] == {"pnp-ransac on tiny": "ZeroDivisionError: a bug"}
@@ -260,7 +260,7 @@ def test_a_bug_of_a_method_costs_its_run(
 def test_where_every_method_fails_the_report_says_so(
     tiny, tmp_path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setitem(METHODS, "identity", broken)
+    monkeypatch.setitem(METHODS, "identity", Method(broken))
     words = [
         "compare",
         str(tiny),
@@ -329,7 +329,7 @@ def test_a_folder_stands_for_its_sequences(tree: Path, walk: Path) -> None:
 def test_weights_of_a_method_are_all_that_it_reads(tmp_path: Path) -> None:
     names, missing = methods_to_run(("all",))
     assert {"hybrid", "classical", "identity"} <= set(names)
-    assert set(missing) == set(METHODS) - set(names)
+    assert set(missing) == set(method_names()) - set(names)
     (tmp_path / "pwvo").write_bytes(b"other weights")
     other = Models(weights={"pwvo": tmp_path / "pwvo"})
     assert weights_hash("hybrid", other) != weights_hash("hybrid", Models())

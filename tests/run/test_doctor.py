@@ -15,8 +15,6 @@ import pytest
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.types import Frame
 from hybridvo.io.data.image_io import read_flow
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
 from hybridvo.run.commands.diagnosis import extras, speed
 from hybridvo.run.commands.diagnosis.extras import EXTRAS, missing_extras
@@ -24,6 +22,9 @@ from hybridvo.run.commands.diagnosis.registration import registration
 from hybridvo.run.commands.doctor import diagnose, installation
 from hybridvo.run.commands.text import text_of
 from hybridvo.tracking.camera_drift import MIN_CAMERA_STEPS
+from hybridvo_lab.commands import demo
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 
 
 def test_doctor_compiles_the_kernels_of_a_run_and_of_the_demo(monkeypatch):
@@ -274,7 +275,7 @@ def test_how_fast_a_sequence_is_tracked_and_by_which_stages(image_walk, capsys):
 
 def test_the_demo_is_tracked_where_no_sequence_is_named(monkeypatch):
     monkeypatch.setattr(speed, "SPEED_FRAMES", 6)
-    monkeypatch.setattr(speed, "HEIGHT", 60)
-    monkeypatch.setattr(speed, "WIDTH", 80)
+    monkeypatch.setattr(demo, "HEIGHT", 60)
+    monkeypatch.setattr(demo, "WIDTH", 80)
     report = speed.speed()
     assert (report["motions"], report["size"]) == (1, [80, 60])

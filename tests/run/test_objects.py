@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridvo.lab.synthetic.render import write_sintel
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.cli import main
 from hybridvo.run.commands.object_rows import COLUMNS, OBJECTS
+from hybridvo_lab.synthetic.render import write_sintel
+from hybridvo_lab.synthetic.scenes import make_scene
 
 FRAMES = 4
 SIZE = (96, 160)

@@ -19,10 +19,10 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core.results import RelativePose
 from hybridvo.core.trajectory import read_trajectory
-from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.pipeline import METHODS, Found
+from hybridvo.pipeline import METHODS, Found, Method
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run_folder import CHECKPOINT, STATE
+from hybridvo_lab.synthetic.scenes import make_scene
 
 FRAMES = 6
 
@@ -358,7 +358,7 @@ def test_a_motion_of_probability_0_is_never_followed(
     def certain_to_be_wrong(evidence, ctx):
         yield Found(motion, evidence.pair)
 
-    monkeypatch.setitem(METHODS, "classical", certain_to_be_wrong)
+    monkeypatch.setitem(METHODS, "classical", Method(certain_to_be_wrong))
     assert run(dataset, tmp_path, "--flow", "dis", "--max-failed", "1") == 0
     assert {row["status"] for row in rows(tmp_path)[1:]} == {"failed"}
     assert (poses(tmp_path) == np.eye(4)).all()

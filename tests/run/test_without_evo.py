@@ -62,7 +62,7 @@ def test_the_public_call_returns_none_with_a_reason(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        "hybridvo.lab.evaluation.metrics.find_spec", lambda name: None
+        "hybridvo_lab.evaluation.metrics.find_spec", lambda name: None
     )
     path = hybridvo.Trajectory(np.arange(3), np.tile(np.eye(4), (3, 1, 1)))
     report = hybridvo.evaluate(path, path)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from hybridvo.api import refine
-from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.calibration import LONG_GROWTH
 from hybridvo.solver.covariance import ScoreStatistics, motion_covariance
 from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.score_blocks import UPPER, block_sums, long_range
 from hybridvo.solver.shared_errors import SharedErrors
+from hybridvo_lab.synthetic.noise_scenarios import make_pair
 
 FINE, ROWS, COLUMNS = 4, 7, 16
 """Readings along the side of a tile, and tiles: those of a image of 436x1024."""

@@ -14,7 +14,7 @@ import torch
 import hybridvo as hvo
 from hybridvo.core import torch_geometry
 from hybridvo.core.results import Reason
-from hybridvo.lab.synthetic.noise_scenarios import make_pair
+from hybridvo_lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 
 SIZE = (120, 160)
@@ -207,7 +207,7 @@ def test_kornia_and_pypose_carry_the_method(pairs, calls) -> None:
 def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
     """At the paper's size, where oneDNN wrote past its memory under strided 1x1 convolutions."""
     from hybridvo.network.inputs import assemble_inputs
-    from hybridvo.network.paper.networks import NetworkOptions, build_network
+    from hybridvo_lab.paper.networks import NetworkOptions, build_network
 
     torch.manual_seed(0)
     network = build_network(NetworkOptions(width=0.25)).to(

@@ -12,9 +12,9 @@ from hybridvo.api import refine
 from hybridvo.core.geometry import ego_flow_error, invert
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.flow.providers import dis_flow
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.solver.refine_images import refine_photometric
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 
 HEIGHT, WIDTH = 160, 256
 

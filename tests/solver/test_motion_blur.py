@@ -9,9 +9,9 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import ego_flow, invert, mean_flow, se3_exp, se3_log
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.lab.synthetic.slow_scenes import noisy_image
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.slow_scenes import noisy_image
 from tests.worlds import CHI2_3SIGMA
 
 SIZE = (240, 320)

@@ -13,8 +13,8 @@ from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow_error, se3_exp, se3_log
 from hybridvo.core.results import Reason
 from hybridvo.core.types import FramePair, PairBatch
-from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.torch.patches import PatchPoses, patch_poses
+from hybridvo_lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 
 NOISE = (0.3, 0.005)

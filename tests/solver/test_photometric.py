@@ -13,14 +13,14 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Status
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.providers import dis_flow
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.solver.image_factor import ImageFactor
 from hybridvo.solver.image_kernels import read_cubic
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import State
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.rows import ImageRow
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 
 MEASURED = range(300, 306)
 """Seeds of the development range that no constant was tuned on."""

@@ -15,7 +15,7 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import Reason, State
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.lab.synthetic.noise_scenarios import make_pair
+from hybridvo_lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 
 CAMERA = Camera(350.0, 340.0, 159.0, 82.0, 160, 320)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
 from hybridvo.solver import kernels
 from hybridvo.solver.noise_estimation import FLOW_NOISE_FLOOR_PX
 from hybridvo.solver.pixels import PixelGrid
@@ -15,6 +14,7 @@ from hybridvo.solver.shared_errors import (
     shared_covariance,
     tile_pulls,
 )
+from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 
 PARTS = parts_of_tiles(8, 8)
 """Of a view of 8 x 8 tiles."""

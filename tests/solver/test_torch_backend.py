@@ -20,11 +20,11 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, State
 from hybridvo.core.torch_geometry import pixel_grid, reproject, se3
 from hybridvo.core.types import PairBatch
-from hybridvo.lab.synthetic.noise_scenarios import make_pair
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.torch.backend import BatchedPose, refine_batch
 from hybridvo.solver.torch.covariance import checked
 from hybridvo.solver.torch.factors import KERNELS
+from hybridvo_lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 from tests.solver.batches import F64, noisy_batch
 

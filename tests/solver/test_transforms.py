@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import hybridvo as hvo
+from hybridvo_lab.windows.window import refine_window
 from tests.solver.batches import noisy_batch
 
 BATCH, _ = noisy_batch(1, (16, 20), outliers=0)
@@ -25,7 +26,7 @@ def of_weights(weights: torch.Tensor) -> torch.Tensor:
 
 
 def of_noise(noise: torch.Tensor) -> torch.Tensor:
-    return hvo.refine_window(BATCH, [[0, 1]], noise=noise).T_frame_first
+    return refine_window(BATCH, [[0, 1]], noise=noise).T_frame_first
 
 
 def of_depth(depth: torch.Tensor) -> torch.Tensor:

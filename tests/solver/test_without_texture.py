@@ -10,7 +10,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.flow.providers import has_texture
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests import worlds
 
 SIZE = (240, 320)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hybridvo import open_sequence
-from hybridvo.baselines import missing
+from hybridvo_lab.baselines import missing
 from tests.scripts import load_script
 
 recorded = load_script("tools/bench/recorded.py")

@@ -7,9 +7,9 @@ import pytest
 
 from hybridvo import PWVO
 from hybridvo.core.geometry import ego_flow
-from hybridvo.lab.synthetic.noise_scenarios import make_pair
-from hybridvo.lab.synthetic.paper_samples import KnownPair
 from hybridvo.network.pair_maps import look_at_pair
+from hybridvo_lab.synthetic.noise_scenarios import make_pair
+from hybridvo_lab.synthetic.paper_samples import KnownPair
 from tests.scripts import load_script
 
 makers = load_script("tools/maker_pairs.py")

@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from hybridvo.baselines import missing
 from hybridvo.core.geometry import invert, se3_exp
 from hybridvo.core.types import Frame
-from tests.baselines.test_peers import CAMERA, box_depth
+from hybridvo_lab.baselines import missing
+from tests.lab.baselines.test_peers import CAMERA, box_depth
 from tests.scripts import load_script
 
 peers = load_script("tools/bench/peers.py")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from hybridvo.lab.evaluation import report
-from hybridvo.lab.evaluation.protocols import protocols
+from hybridvo_lab.evaluation import report
+from hybridvo_lab.evaluation.protocols import protocols
 from tests.scripts import ROOT, load_script
 
 
@@ -16,7 +16,7 @@ def _tools_import_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_grid_of_limits_scores_every_limit():
     grid = load_script("tools/bench/thresholds.py")
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
+    from hybridvo_lab.synthetic.noise_scenarios import make_pair
 
     pair, truth = make_pair("moving30", 1, 109, 256)
     limits = {grid.BY_NOISE: None, "1.5 px": 1.5, "60 px": 60.0}
@@ -34,7 +34,7 @@ def test_the_grid_of_limits_scores_every_limit():
 def test_the_benchmark_scores_what_is_known():
     """One scenario, one pair: the refinement is right, and no motion is not."""
     benchmark = load_script("tools/bench/methods.py")
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
+    from hybridvo_lab.synthetic.noise_scenarios import make_pair
 
     methods, _ = benchmark.estimators(("classical", "identity"))
     records: dict[str, list[dict]] = {method: [] for method in methods}

@@ -10,11 +10,11 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
-from hybridvo.lab.synthetic.bodies import draw_texture
-from hybridvo.lab.synthetic.draws import affine, random_rotation
-from hybridvo.lab.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
-from hybridvo.lab.synthetic.render import Scene, Solid
-from hybridvo.lab.synthetic.slow_scenes import noisy_image
+from hybridvo_lab.synthetic.bodies import draw_texture
+from hybridvo_lab.synthetic.draws import affine, random_rotation
+from hybridvo_lab.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
+from hybridvo_lab.synthetic.render import Scene, Solid
+from hybridvo_lab.synthetic.slow_scenes import noisy_image
 
 SIZE = (120, 160)
 SEED = 1

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 import hybridvo as hvo
 from hybridvo.core.geometry import backproject
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.tracking.camera_drift import (
     MIN_CAMERA_STEPS,
     Bend,
@@ -18,6 +17,7 @@ from hybridvo.tracking.camera_drift import (
     bends_of,
     robust_mean,
 )
+from hybridvo_lab.synthetic.scenes import make_scene
 
 PERIOD_S = 1 / 30
 """Time between two frames."""

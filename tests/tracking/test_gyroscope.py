@@ -14,11 +14,11 @@ import hybridvo as hvo
 from hybridvo.core.geometry import invert, make_transform
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.io.data.open import open_sequence
-from hybridvo.lab.synthetic.render import SyntheticSequence
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking import odometry
 from hybridvo.tracking.gyroscope import Gyroscope
+from hybridvo_lab.synthetic.render import SyntheticSequence
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests import bags, captures, slow_walk
 from tests.io.data.test_stereo import euroc_folder
 from tests.io.data.test_video import stray

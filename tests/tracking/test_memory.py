@@ -19,7 +19,6 @@ from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.types import FramePair
 from hybridvo.hypotheses.direct import direct_start
-from hybridvo.lab.synthetic.slow_scenes import slow_scene
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
@@ -37,6 +36,7 @@ from hybridvo.tracking.memory import (
     nothing_known,
     updated_log_odds,
 )
+from hybridvo_lab.synthetic.slow_scenes import slow_scene
 from tests import slow_walk
 
 SIZE = (120, 160)

@@ -13,13 +13,13 @@ import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import Step
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.tracking.object_motions import (
     Earlier,
     View,
 )
 from hybridvo.tracking.objects import MAX_OBJECTS, Things, after_step
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests.worlds import CHI2_3SIGMA
 
 SIZE = (120, 160)

@@ -14,9 +14,9 @@ from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import Reason, State
 from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.providers import FlowField, dis_flow
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo.tracking.odometry import Odometry
+from hybridvo_lab.synthetic.scenes import make_scene
 
 HEIGHT, WIDTH = 48, 64
 CAMERA = Camera(60, 60, 31.5, 23.5, HEIGHT, WIDTH)

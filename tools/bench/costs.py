@@ -161,7 +161,7 @@ def batches(seed0: int) -> list[dict[str, Any]]:
     import torch
 
     from hybridvo import PWVO, PairBatch, refine, select
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
+    from hybridvo_lab.synthetic.noise_scenarios import make_pair
 
     seeds = range(seed0, seed0 + max(BATCHES))
     pairs = [make_pair("moving30", seed, *BATCH_SIZE)[0] for seed in seeds]

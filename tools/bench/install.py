@@ -68,7 +68,7 @@ start = time.perf_counter()
 used = time.process_time()
 import numpy as np
 import hybridvo as hvo
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 scene = make_scene("light", 0, height=218, width=512, frames=2)
 frames = [scene.render(index) for index in range(2)]
 rendered = time.perf_counter()
@@ -83,7 +83,7 @@ print([time.perf_counter() - rendered, time.process_time() - used_before])
 RENDER = """
 import sys
 import numpy as np
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 for kind in ("static", "light"):
     scene = make_scene(kind, 0, height=480, width=640, frames=12)
     frames = [scene.render(index) for index in range(12)]

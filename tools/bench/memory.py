@@ -35,7 +35,7 @@ from hybridvo.core.belief import Belief
 from hybridvo.core.geometry import invert
 from hybridvo.core.options import TrackOptions
 from hybridvo.flow.providers import dis_flow, with_flow
-from hybridvo.lab.training.validation import area_under_curve
+from hybridvo_lab.training.validation import area_under_curve
 
 STANDING = ("corridor", "lab_close", "lab_far", "books", "boxes", "fruit")
 """Recordings below ``tripod`` of the data folder."""

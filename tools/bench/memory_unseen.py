@@ -23,7 +23,7 @@ from bench import objects
 from bench.memory import MODES, Judged, counted, judged
 from hybridvo import Frame
 from hybridvo.core.geometry import invert
-from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
+from hybridvo_lab.synthetic.semi_real import draw_clip, load_split
 
 SCENE_FRAMES = 12
 CLIP_FRAMES = 10

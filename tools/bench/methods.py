@@ -141,7 +141,7 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
     """Pairs without images, with known noise: error, time and
     covariance in every scenario.
     """
-    from hybridvo.lab.synthetic.noise_scenarios import MAIN_SCENARIOS, SCENARIOS
+    from hybridvo_lab.synthetic.noise_scenarios import MAIN_SCENARIOS, SCENARIOS
 
     methods, missing = estimators(FLOW_ONLY)
     work = partial(scenario, range(args.seed0, args.seed0 + args.pairs))
@@ -165,7 +165,7 @@ def scenarios(args: argparse.Namespace) -> dict[str, Any]:
 
 def scenario(seeds: range, name: str) -> dict[str, Any]:
     """Figures of each method in a scenario."""
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
+    from hybridvo_lab.synthetic.noise_scenarios import make_pair
 
     methods, _ = estimators(FLOW_ONLY)
     records: Records = {method: [] for method in methods}
@@ -183,7 +183,7 @@ def model_noise(args: argparse.Namespace) -> dict[str, Any]:
     the covariance is right.
     """
     from hybridvo import refine
-    from hybridvo.lab.synthetic.noise_scenarios import make_model_pair
+    from hybridvo_lab.synthetic.noise_scenarios import make_model_pair
 
     records: Records = {"classical": []}
     for seed in range(args.seed0, args.seed0 + args.model_pairs):

@@ -25,10 +25,10 @@ from measuring import digits, parser_of, provenance, write_result
 from scipy.spatial.transform import Rotation
 
 from hybridvo import Camera, Frame, FramePair, Odometry, chain_covariance
-from hybridvo.baselines import estimate
 from hybridvo.core.geometry import invert, rotation_angle
 from hybridvo.flow.providers import dis_flow, with_flow
-from hybridvo.lab.synthetic.turned_windows import (
+from hybridvo_lab.baselines import estimate
+from hybridvo_lab.synthetic.turned_windows import (
     TripodRecording,
     load_tripod,
     turning_camera,

@@ -40,9 +40,9 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.options import TrackOptions
 from hybridvo.io.masks import object_colour
-from hybridvo.lab.synthetic.render import Scene, Solid
-from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.lab.synthetic.slow_scenes import (
+from hybridvo_lab.synthetic.render import Scene, Solid
+from hybridvo_lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.slow_scenes import (
     noisy_image,
     slow_scene,
     structured_light,

@@ -18,8 +18,8 @@ from measuring import digits, parser_of, provenance, store
 
 from hybridvo import Frame, Step, open_sequence
 from hybridvo.core.trajectory import Trajectory
-from hybridvo.lab.evaluation.metrics import evaluate
 from hybridvo.tracking.passes import track_in_passes
+from hybridvo_lab.evaluation.metrics import evaluate
 
 RECORDINGS = (
     "tum/rgbd_dataset_freiburg1_rpy_100",

@@ -34,17 +34,17 @@ from hybridvo import (
     Odometry,
     open_sequence,
 )
-from hybridvo.baselines import ALIGNERS, WITHOUT_FLOW
-from hybridvo.baselines.clouds import (
+from hybridvo.core.errors import DegenerateError
+from hybridvo.core.geometry import invert, rotation_angle
+from hybridvo.flow.providers import FlowField
+from hybridvo_lab.baselines import ALIGNERS, WITHOUT_FLOW
+from hybridvo_lab.baselines.clouds import (
     CLOUD_RANGE_RATIO,
     kiss_odometry,
     median_depth,
     points_of,
 )
-from hybridvo.core.errors import DegenerateError
-from hybridvo.core.geometry import invert, rotation_angle
-from hybridvo.flow.providers import FlowField
-from hybridvo.lab.evaluation.metrics import Match, ate
+from hybridvo_lab.evaluation.metrics import Match, ate
 
 METHODS = (
     *("hybrid", "hybrid-flow", "classical", "pnp-ransac-tuned", "poselib"),

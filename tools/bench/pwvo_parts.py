@@ -33,12 +33,12 @@ from scipy.stats import spearmanr
 from bench.semi_real import StaticPart, static_part
 from hybridvo import PWVO, PairBatch, refine
 from hybridvo.core.geometry import pose_matrix
-from hybridvo.lab.synthetic.paper_samples import KnownPair
-from hybridvo.lab.synthetic.scenes import HEAVY
-from hybridvo.lab.training.validation import allowed_error_px
 from hybridvo.network.pair_maps import Look, look_at_pair
 from hybridvo.network.selection import seed_weights
 from hybridvo.solver.torch.patches import PatchPoses, patch_poses
+from hybridvo_lab.synthetic.paper_samples import KnownPair
+from hybridvo_lab.synthetic.scenes import HEAVY
+from hybridvo_lab.training.validation import allowed_error_px
 
 CLIPS = {"clips, kitchen": "kitchen", "clips, box": "box"}
 """Sets of clips, and how their names begin; the numbers of the region were chosen on the box."""

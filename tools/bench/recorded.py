@@ -19,10 +19,11 @@ import numpy as np
 from known_pairs import rendered
 from measuring import digits, methods_here, proportion, timed
 
-from hybridvo import Frame, FramePair, Odometry, baselines, open_sequence
-from hybridvo.baselines.correspondences import depth_in_range
-from hybridvo.baselines.images import Images, align_opencv
+from hybridvo import Frame, FramePair, Odometry, open_sequence
 from hybridvo.flow.providers import dis_flow
+from hybridvo_lab import baselines
+from hybridvo_lab.baselines.correspondences import depth_in_range
+from hybridvo_lab.baselines.images import Images, align_opencv
 
 RECORDINGS = (
     "tripod/corridor",

@@ -147,9 +147,9 @@ def write_tables(count: int) -> int:
 
     from hybridvo.core.options import Options
     from hybridvo.core.trajectory import Trajectory
-    from hybridvo.lab.evaluation import scores
     from hybridvo.network.models import Models
-    from hybridvo.run.commands import compare
+    from hybridvo_lab.commands import compare
+    from hybridvo_lab.evaluation import scores
 
     rng = np.random.default_rng(0)
     numbers = np.arange(count)
@@ -198,7 +198,7 @@ def write_tables(count: int) -> int:
 
 def workers(args: argparse.Namespace) -> dict[str, Any]:
     """Wall time of a comparison in one process, by one worker and by two."""
-    from hybridvo.core.cluster import Workers
+    from hybridvo_lab.cluster import Workers
 
     seconds = {}
     with tempfile.TemporaryDirectory() as name:
@@ -228,7 +228,7 @@ def compared(
 ) -> float:
     """Seconds of a comparison of methods on sequences by some workers."""
     from hybridvo.core.options import FlowOptions, Options
-    from hybridvo.run.commands.compare import compare
+    from hybridvo_lab.commands.compare import compare
 
     options = Options(flow=FlowOptions(source="dis"))
     _, ms = timed(
@@ -242,7 +242,7 @@ def local_workers(count: int) -> Iterator[Any]:
     """So many workers of one thread each, as long as the context lasts."""
     from distributed import LocalCluster
 
-    from hybridvo.core.cluster import ONE_THREAD, Workers
+    from hybridvo_lab.cluster import ONE_THREAD, Workers
 
     with LocalCluster(
         n_workers=count,
@@ -256,8 +256,8 @@ def local_workers(count: int) -> Iterator[Any]:
 
 def write_sequences(folder: Path, count: int, frames: int) -> list[Path]:
     """Render the sequences that workers share."""
-    from hybridvo.lab.synthetic.render import write_sintel
-    from hybridvo.lab.synthetic.scenes import make_scene
+    from hybridvo_lab.synthetic.render import write_sintel
+    from hybridvo_lab.synthetic.scenes import make_scene
 
     height, width = SIZE
     paths = []

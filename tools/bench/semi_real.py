@@ -4,7 +4,7 @@ probability can be believed.
     python tools/benchmark.py semi_real --pairs 160 --out docs/results/semi_real.json
     python tools/benchmark.py semi_real --split development --methods hybrid-flow
 
-Pairs of :mod:`hybridvo.lab.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An
+Pairs of :mod:`hybridvo_lab.synthetic.semi_real` on DIS flow, drawn from fixed seeds. An
 answer is wrong when its ego flow over the static pixels errs by more than 3 px; or
 by more than 1 px and more than three times as much as ``classical`` does inside the
 true static mask.
@@ -34,9 +34,9 @@ from measuring import (
 )
 
 from hybridvo import estimate, refine
-from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
-from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
+from hybridvo_lab.synthetic.semi_real import draw_clip, load_split
+from hybridvo_lab.training.validation import allowed_error_px, area_under_curve
 
 METHODS = ("classical", "hybrid-flow", "poselib")
 """Methods by default."""

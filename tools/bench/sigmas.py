@@ -42,9 +42,9 @@ from scipy.stats import chi2
 
 from hybridvo import estimate, open_sequence
 from hybridvo.core.geometry import invert, make_transform
-from hybridvo.lab.calibration import WRONG_PX
-from hybridvo.lab.synthetic.paper_samples import KnownPair
-from hybridvo.lab.synthetic.semi_real import draw_clip, load_split
+from hybridvo_lab.calibration import WRONG_PX
+from hybridvo_lab.synthetic.paper_samples import KnownPair
+from hybridvo_lab.synthetic.semi_real import draw_clip, load_split
 
 METHODS = ("hybrid", "hybrid-flow", "classical", "pwvo-refine")
 SEED = 21

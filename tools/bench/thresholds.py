@@ -115,7 +115,7 @@ def multiples(methods: list[str], seeds: Iterable[int]) -> dict[str, Any]:
     """Geometric mean of the scenarios' median errors, px, by
     limits in standard deviations.
     """
-    from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
+    from hybridvo_lab.synthetic.noise_scenarios import SCENARIOS, make_pair
 
     names = [str(k) for k in MULTIPLES]
     medians: dict[str, dict[str, list[float]]]
@@ -149,7 +149,7 @@ def answer(
 
     The scores are appended to the records.
     """
-    from hybridvo import baselines
+    from hybridvo_lab import baselines
 
     motions = {}
     for method, by_limit in records.items():

@@ -21,14 +21,14 @@ from scipy.stats import chi2
 
 from hybridvo import Frame, Odometry, open_sequence
 from hybridvo.core.geometry import invert, se3_log
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.slow_scenes import (
+from hybridvo.tracking.calibration import KEYFRAME_CORRELATION
+from hybridvo.tracking.chains import PathCovariance
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.slow_scenes import (
     noisy_image,
     slow_scene,
     structured_light,
 )
-from hybridvo.tracking.calibration import KEYFRAME_CORRELATION
-from hybridvo.tracking.chains import PathCovariance
 
 KINDS = ("static", "light", "heavy_two")
 """Families of scenes."""

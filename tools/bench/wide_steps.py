@@ -29,7 +29,7 @@ from hybridvo import FramePair, Options, RelativePose, estimate, open_sequence
 from hybridvo.core.geometry import invert, rotation_angle
 from hybridvo.core.options import SearchOptions
 from hybridvo.hypotheses.matches import matched_motions
-from hybridvo.lab.evaluation.scores import true_motion
+from hybridvo.io.data.truth import true_motion
 
 RECORDINGS: dict[str, tuple[int, ...]] = {
     "tum/rgbd_dataset_freiburg1_rpy_100": (3, 6, 9, 12),

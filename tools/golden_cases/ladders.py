@@ -85,7 +85,7 @@ def grey_noise_of_negated_flow(seed: int) -> list[Record]:
 
 def with_grey_noise(pair: Any, std: float) -> Any:
     """Return a pair with noisier images; only the strength differs from rung to rung."""
-    from hybridvo.lab.synthetic.slow_scenes import noisy_image
+    from hybridvo_lab.synthetic.slow_scenes import noisy_image
 
     rng = np.random.default_rng(5)
     prev, curr = (
@@ -185,7 +185,7 @@ def with_true_flow(prev: Any, curr: Any, T: np.ndarray) -> Known:
 
 def noisy_depth_of_frozen_images(seed: int) -> list[Record]:
     """Images handed out twice, beside depth maps that get noisier: the last tell nothing."""
-    from hybridvo.lab.synthetic.slow_scenes import structured_light
+    from hybridvo_lab.synthetic.slow_scenes import structured_light
 
     pairs = []
     for scene_seed in (900, 901):
@@ -364,7 +364,7 @@ def prior_of_an_object(seed: int) -> list[Record]:
 
 def coherent_flow(seed: int) -> list[Record]:
     """Static pairs whose flow has a smooth error beside white noise."""
-    from hybridvo.lab.synthetic.draws import smooth_field
+    from hybridvo_lab.synthetic.draws import smooth_field
 
     pairs = []
     for number in range(8):

@@ -53,7 +53,7 @@ WALKS = (("light", 6), ("light", 10))
 
 def cases() -> dict[str, Run]:
     """Return every case by its name; what stands before the slash shares its inputs."""
-    from hybridvo.lab.synthetic.noise_scenarios import (
+    from hybridvo_lab.synthetic.noise_scenarios import (
         DEGENERATE_SCENARIOS,
         MAIN_SCENARIOS,
     )

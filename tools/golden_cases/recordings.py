@@ -176,7 +176,7 @@ def late_frames(
 def wrong_limits(kind: str, metres: float, seed: int) -> list[Record]:
     """The error beyond which a motion is called wrong: ``std``, 1e-3 px."""
     from hybridvo import Camera
-    from hybridvo.lab.evaluation.scores import wrong_limit
+    from hybridvo_lab.evaluation.scores import wrong_limit
 
     camera = Camera(500.0, 500.0, 319.5, 239.5, 480, 640)
     limit = wrong_limit(kind, camera, np.full(camera.shape, metres, np.float32))
@@ -185,7 +185,7 @@ def wrong_limits(kind: str, metres: float, seed: int) -> list[Record]:
 
 def wrong_motions(seed: int) -> list[Record]:
     """Errors that grow, of which no limit is known: how many are called wrong."""
-    from hybridvo.lab.evaluation.scores import pair_scores, pair_table
+    from hybridvo_lab.evaluation.scores import pair_scores, pair_table
 
     found = []
     for error in (0.5, 0.6, 0.75, 0.9, 1.1, 1.25, 1.4, 1.6):
@@ -199,7 +199,7 @@ def far_positions(seed: int) -> list[Record]:
     """Positions ever farther away, until an evaluation refuses them."""
     from hybridvo.core.errors import InputError
     from hybridvo.core.trajectory import Trajectory
-    from hybridvo.lab.evaluation.metrics import evaluate
+    from hybridvo_lab.evaluation.metrics import evaluate
 
     found = []
     for metres in 1e12 * np.array([0.5, 0.6, 0.75, 0.9, 1.1, 1.25, 1.4, 1.6]):

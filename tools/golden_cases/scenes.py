@@ -55,7 +55,7 @@ def scene_pairs(kind: str) -> tuple[Known, ...]:
 
 def made_scene(kind: str, seed: int, frames: int, size: tuple[int, int]) -> Any:
     """Return a rendered scene."""
-    from hybridvo.lab.synthetic.scenes import make_scene
+    from hybridvo_lab.synthetic.scenes import make_scene
 
     height, width = size
     return make_scene(kind, seed, height=height, width=width, frames=frames)
@@ -93,7 +93,7 @@ class Walk(NamedTuple):
 def walk(kind: str, seed: int, size: tuple[int, int] = SIZE) -> Walk:
     """Return a scene slowed down, so that its objects move by less than the noise a step."""
     from hybridvo import Frame
-    from hybridvo.lab.synthetic.slow_scenes import (
+    from hybridvo_lab.synthetic.slow_scenes import (
         noisy_image,
         slow_scene,
         structured_light,
@@ -113,7 +113,7 @@ def walk(kind: str, seed: int, size: tuple[int, int] = SIZE) -> Walk:
 @functools.cache
 def made_pair(scenario: str, seed: int) -> Known:
     """Return a pair without images: known noise, moving objects, gross errors of the flow."""
-    from hybridvo.lab.synthetic.noise_scenarios import make_pair
+    from hybridvo_lab.synthetic.noise_scenarios import make_pair
 
     pair, truth = make_pair(scenario, seed, *MADE_SIZE)
     return Known(pair, truth["T_curr_prev"], truth["depth_true"])
@@ -127,7 +127,7 @@ def still_pair(
     size: tuple[int, int] = MADE_SIZE,
 ) -> Known:
     """Return a made pair in which nothing but the camera moves, without gross errors."""
-    from hybridvo.lab.synthetic.noise_scenarios import Scenario, make_pair
+    from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 
     conditions = Scenario(
         moving=0.0,
@@ -143,7 +143,7 @@ def still_pair(
 @functools.cache
 def model_pair(seed: int) -> Known:
     """Return a static pair whose noise is what the refinement assumes."""
-    from hybridvo.lab.synthetic.noise_scenarios import make_model_pair
+    from hybridvo_lab.synthetic.noise_scenarios import make_model_pair
 
     pair, truth = make_model_pair(seed)
     depth = truth["depth_true"].astype(np.float32)

@@ -16,7 +16,7 @@ from hybridvo import __version__
 from hybridvo.core.errors import did_you_mean, printable
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.run.commands import dispatch
-from hybridvo.run.commands.dispatch import Outcome, calling
+from hybridvo.run.commands.dispatch import Outcome, calling, from_laboratory
 
 # s that the doctor looks at a live camera: 150 frames, two turns to and fro
 DOCTOR_SECONDS = 5.0
@@ -432,7 +432,7 @@ LIVE = command(
 COMPARE = command(
     "compare",
     "Run methods side by side and write a report.",
-    calling("hybridvo.run.commands.compare:compare"),
+    from_laboratory("compare"),
     *reading(),
     *OPTIONS,
     MODE,
@@ -470,7 +470,7 @@ COMPARE = command(
 SHOW = command(
     "show",
     "Draw the maps of one pair of a sequence.",
-    calling("hybridvo.run.commands.show:draw_pair"),
+    from_laboratory("show"),
     *sequence(),
     WEIGHTS,
     Either(
@@ -569,7 +569,7 @@ CONVERT = command(
 DEMO = command(
     "demo",
     "Render a scene with moving objects and run on it.",
-    calling("hybridvo.run.commands.demo:demo"),
+    from_laboratory("demo"),
     word("--out DIR", "default: %(default)s", default="runs/demo"),
     OVERWRITE,
     count("--frames N", "default: 20", default=20),
@@ -578,7 +578,7 @@ DEMO = command(
 GENERATE = command(
     "generate",
     "Draw training samples into a folder.",
-    calling("hybridvo.run.commands.train:generate"),
+    from_laboratory("generate"),
     word(
         "--preset",
         "paper, diverse or a YAML file; default: %(default)s",
@@ -617,7 +617,7 @@ TRAIN_PAPER = command(
 TRAIN_EXPORT = command(
     "export",
     "write a network's weights for users (int8)",
-    calling("hybridvo.lab.training.trainer:export_run"),
+    from_laboratory("train-export"),
     word("--out", "folder of the run", dest="folder", type=Path, required=True),
     word("--export FILE", "*.safetensors", dest="path", type=Path, required=True),
     count("--count", "held-out pairs of each preset", default=1000),
@@ -625,7 +625,7 @@ TRAIN_EXPORT = command(
 TRAIN_SAMPLES = command(
     "samples",
     "draw samples for PWVO",
-    calling("hybridvo.run.commands.train:draw_training_samples"),
+    from_laboratory("train-samples"),
     SHARDS,
     count("--first-seed", "below 1000: held out", default=1000000),
     count("--seeds", "about as many samples", default=0),

@@ -18,6 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from hybridvo.core import laboratory
 from hybridvo.run.commands.early import (
     check_camera,
     check_config,
@@ -61,11 +62,41 @@ def calling(place: str) -> Callable[[Namespace], Outcome]:
     return partial(_call_place, place)
 
 
+def from_laboratory(name: str) -> Callable[[Namespace], Outcome]:
+    """Return a command that calls a function of hybridvo-lab, likewise."""
+    return partial(_call_laboratory, name)
+
+
 def _call_place(place: str, args: Namespace) -> Outcome:
     """Call ``MODULE:FUNCTION`` with the arguments that it takes."""
     given = prepared(args)
     module, _, name = place.partition(":")
-    result = call(getattr(import_module(module), name), given)
+    return _outcome_of(getattr(import_module(module), name), given)
+
+
+def _call_laboratory(name: str, args: Namespace) -> Outcome:
+    """Call a function of hybridvo-lab with the arguments that it takes."""
+    laboratory.check_there(laboratory.COMMANDS, name, _as_typed(name))
+    given = prepared(args)
+    return _outcome_of(_command_of_laboratory(name), given)
+
+
+def _command_of_laboratory(name: str) -> Callable[..., Any]:
+    """The function of hybridvo-lab that a command calls."""
+    found: Callable[..., Any] = laboratory.wanted(
+        laboratory.COMMANDS, name, _as_typed(name)
+    )
+    return found
+
+
+def _as_typed(name: str) -> str:
+    """A command as it is typed."""
+    return f"'hybridvo {name.replace('-', ' ')}'"
+
+
+def _outcome_of(function: Callable[..., Any], given: Mapping[str, Any]) -> Outcome:
+    """The outcome of a function that returns a report or the file it wrote."""
+    result = call(function, given)
     if isinstance(result, Path):
         result = {"files": [str(result)]}
     return Outcome(result)
@@ -118,14 +149,10 @@ def evaluate(args: Namespace) -> Outcome:
     from hybridvo.core.errors import InputError
 
     if args.protocol is None:
-        from hybridvo.lab.evaluation.metrics import evaluate
-
-        report = call(evaluate, given)
+        report = call(_command_of_laboratory("evaluate"), given)
         reasons = [report["reasons"].get("ate_rmse_unaligned")]
     else:
-        from hybridvo.lab.evaluation.path_scores import evaluate_path
-
-        report = call(evaluate_path, given)
+        report = call(_command_of_laboratory("evaluate-path"), given)
         reasons = list(dict.fromkeys(report["reasons"].values()))
     if report["matched"] == 0:
         raise InputError(f"nothing could be compared: {'; '.join(reasons)}.")
@@ -165,9 +192,7 @@ def train(args: Namespace) -> Outcome:
     """``hybridvo train pwvo`` and ``train paper``: train a network."""
     check_config(args.config)
     given = prepared(args)
-    from hybridvo.run.commands.train import train_network
-
-    return Outcome(call(train_network, given))
+    return Outcome(call(_command_of_laboratory("train"), given))
 
 
 # -- what commands share -----------------------------------------------------------------
@@ -198,9 +223,8 @@ def prepared(args: Namespace) -> dict[str, Any]:
         device = options.run.device if options else "cpu"
         given["models"] = _models(args.weights, device)
     if "jobs" in args:
-        from hybridvo.core.cluster import Workers
-
-        given["workers"] = Workers(args.jobs, args.cluster)
+        workers = laboratory.wanted(laboratory.FUNCTIONS, "workers", "--jobs")
+        given["workers"] = workers(args.jobs, args.cluster)
     if "dataset" in args:
         from hybridvo.io.data.open import open_sequence
 
@@ -259,9 +283,9 @@ def _options(given: Mapping[str, Any]) -> Options:
 def _models(weights: Sequence[str], device: str) -> Models:
     """Make the networks, some of which have weights that are given as NAME=FILE."""
     from hybridvo.core.errors import InputError
-    from hybridvo.network.models import SELECTION, Models
+    from hybridvo.network.models import Models, network_names
 
-    known = ("pwvo", *SELECTION)
+    known = network_names()
     files: dict[str, str | Path] = {}
     for text in weights:
         name, _, path = text.partition("=")

@@ -15,6 +15,7 @@ import pandas as pd
 from hybridvo.api import estimate
 from hybridvo.compiled.ahead_of_time import compile_ahead
 from hybridvo.compiled.shipped_kernels import kernels_in_use
+from hybridvo.core import laboratory
 from hybridvo.core.depth_units import depth_unit_fix, typical_depth
 from hybridvo.core.errors import InputError, printable
 from hybridvo.core.files import versions
@@ -25,9 +26,9 @@ from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.io.cameras.folder import FolderCamera
 from hybridvo.io.cameras.settings import LIVE_RATE_HZ, read_preset
 from hybridvo.io.data.sequence import Sequence
+from hybridvo.io.data.truth import true_motion
+from hybridvo.io.example import example_frames
 from hybridvo.io.resolution import resolution_question
-from hybridvo.lab.evaluation.scores import true_motion
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.run.calibration import (
     EMPTY_DEPTH,
     MAX_SCALE_ERROR,
@@ -36,7 +37,6 @@ from hybridvo.run.calibration import (
     MIN_VALID_DEPTH,
 )
 from hybridvo.run.commands.arguments import DOCTOR_SECONDS
-from hybridvo.run.commands.compare import methods_to_run
 from hybridvo.run.commands.diagnosis.answer import Answer
 from hybridvo.run.commands.diagnosis.capture import Captured, capture
 from hybridvo.run.commands.diagnosis.clocks import one_clock
@@ -53,6 +53,7 @@ from hybridvo.run.commands.diagnosis.registration import (
     zoomed_registration,
 )
 from hybridvo.run.commands.diagnosis.rolling_shutter import rolling_shutter
+from hybridvo.run.commands.ready_methods import methods_to_run
 from hybridvo.solver.calibration import DOUBTFUL_SPREAD
 from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
@@ -96,6 +97,8 @@ CLOCK_PAIRS = 3
 def compile_kernels() -> None:
     """Compile all that ``run`` and ``demo`` need, where it is not compiled yet."""
     compile_ahead()
+    if kernels := laboratory.find(laboratory.FUNCTIONS, "kernels"):
+        compile_ahead(path=kernels)
     call_kernels()
 
 
@@ -103,12 +106,10 @@ def call_kernels() -> None:
     """Call all that ``run`` and ``demo`` need; numba compiles what is in no cache."""
     for method in COMPILED_METHODS:
         warm_up(method)
-    # the renderer, what a tracker remembers, and flow from images
-    scene = make_scene("light", 0, height=120, width=160, frames=3)
-    frames = [scene.render(index) for index in range(scene.frames)]
+    # what a tracker remembers, and flow from images
     for method in TRACKED_METHODS:
         tracker = Odometry(method=method)
-        for frame in frames:
+        for frame in example_frames():
             tracker.track(frame)
 
 

@@ -6,16 +6,12 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from hybridvo.core import laboratory
 from hybridvo.core.errors import InputError, did_you_mean
 from hybridvo.io.viewer.address import parse_address
 
 METHODS = (
     *("hybrid", "hybrid-flow", "classical", "pwvo-refine", "pwvo"),
-    *("pwvo-paper", "pwvo-uncertain", "pwvo-naive", "pixelwise"),
-    *("vonet", "vonet-attention"),
-    *("pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"),
-    *("opencv-rgbd", "open3d-rgbd"),
-    *("small-gicp", "kiss-icp", "sift-pnp"),
     "identity",
 )
 """The keys of ``pipeline.METHODS``, whose import loads the numerical libraries."""
@@ -35,12 +31,14 @@ known: hybrid, hybrid-flow, classical, pwvo-refine, pwvo, pwvo-paper, pwvo-uncer
 pixelwise, vonet, vonet-attention, pnp-ransac, pnp-ransac-tuned, usac-magsac, poselib, \
 opencv-rgbd, open3d-rgbd, small-gicp, kiss-icp, sift-pnp, identity.
     """
+    known = (*METHODS[:-1], *laboratory.names_of(laboratory.METHODS), METHODS[-1])
     for name in names:
-        if name in (*METHODS, *EARLIER_METHODS, "all"):
+        if name in (*known, *EARLIER_METHODS, "all"):
             continue
-        hint = did_you_mean(name, METHODS, similarity=0.4)
+        hint = did_you_mean(name, known, similarity=0.4)
         raise InputError(
-            f"method: '{name}' is unknown{hint}; known: {', '.join(METHODS)}."
+            f"method: '{name}' is unknown{hint}; known: {', '.join(known)}"
+            f"{laboratory.more_with_it()}."
         )
 
 

@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
+from hybridvo.core import laboratory
 from hybridvo.core.belief import Belief
 from hybridvo.core.errors import InputError, OutputError, printable
 from hybridvo.core.files import (
@@ -34,27 +35,18 @@ from hybridvo.core.files import (
 from hybridvo.core.geometry import invert
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import NETWORK, Options, RunOptions
-from hybridvo.core.results import Edge, RelativePose, Step
+from hybridvo.core.results import Edge, RelativePose, Step, stated_sigmas
 from hybridvo.core.stages import stage, stage_summary, stage_times
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowProvider, MeasuredFlow, dis_flow, file_flow
 from hybridvo.io.data.sequence import Sequence
+from hybridvo.io.data.truth import true_trajectory
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.io.viewer.address import parse_address
 from hybridvo.io.viewer.recording import Recording, check_recording
 from hybridvo.io.viewer.scene import Seen, Sink, position_covariance
 from hybridvo.io.viewer.viewer import Viewer
-from hybridvo.lab.evaluation.belief import normalised_error, stated_sigmas
-from hybridvo.lab.evaluation.metrics import evaluate
-from hybridvo.lab.evaluation.scores import (
-    pair_scores,
-    pair_table,
-    step_errors,
-    true_motion,
-    true_trajectory,
-)
-from hybridvo.lab.visualization.trajectory import plot_trajectory
 from hybridvo.network.models import Models
 from hybridvo.pipeline import check_method
 from hybridvo.run.commands.advice import advice_on, likely_causes
@@ -142,6 +134,9 @@ RUN_FIELDS = (
     "sequence",
 )
 """Fields of the summary that ``metrics.json`` repeats."""
+NOT_SCORED = (
+    f"no errors and no picture: they need hybridvo-lab: {laboratory.REMEDY}"
+)
 SHOWN_DOUBTS = 20
 """Motions with one reason not to be ok that are shown while a run goes on."""
 DOUBT = ("failed", "degraded", "ok")
@@ -380,6 +375,11 @@ def _interruption_is_kept(folder: RunFolder) -> Iterator[None]:
 # -- one run -----------------------------------------------------------------------------
 
 
+def _scores_of_runs() -> Any:
+    """What scores and draws a run: a module of hybridvo-lab; None where that is not installed."""
+    return laboratory.find(laboratory.FUNCTIONS, "scores_of_runs")
+
+
 @dataclass
 class _Run:
     """A sequence, its tracker, and the folder of the results."""
@@ -394,6 +394,8 @@ class _Run:
     sinks: list[Sink] = field(default_factory=list)
     export: RunExport | None = None
     warnings_shown: int = 0
+    # of hybridvo-lab: errors and the picture; None where it is not installed
+    scores: Any = field(default_factory=_scores_of_runs)
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
@@ -490,7 +492,9 @@ class _Run:
         """
         motion = step.motion
         field = self.flow.last
-        errors = step_errors(self.sequence, prev, step.index, step.T_curr_prev)
+        errors = {}
+        if self.scores is not None:
+            errors = self.scores.errors_of_step(self.sequence, prev, step)
         # the first frame is joined to itself
         edge = step.edge or Edge(step.index, motion.T_curr_prev, motion.covariance)
         return {
@@ -519,9 +523,9 @@ class _Run:
             "edge_covariance": edge.covariance.tolist(),
             "objects": object_rows(step),
             "flow_is_true": field.flow is not None and field.is_true,
-            **errors,
+            **{name: value for name, value in errors.items() if name != "nees"},
             **stated_sigmas(step.covariance),
-            "nees": _nees(self.sequence, prev, step),
+            "nees": errors.get("nees"),
         }
 
     def write_results(self, picture: bool) -> dict[str, Any]:
@@ -546,11 +550,16 @@ class _Run:
             summary["gravity"] = gravity.summary()
         truth = true_trajectory(self.sequence, self.frames)
         metrics = None
-        if truth is not None:
-            metrics = _score(trajectory, truth, steps, options.alignment, summary)
+        if self.scores is None:
+            summary["warnings"].append(NOT_SCORED)
+        elif truth is not None:
+            metrics = self.scores.errors_of_run(
+                trajectory, truth, steps, options.alignment
+            )
+            metrics |= {key: summary[key] for key in RUN_FIELDS}
             write_json(folder / "metrics.json", metrics)
-        if picture:
-            plot_trajectory(
+        if picture and self.scores is not None:
+            self.scores.draw(
                 options.method,
                 trajectory,
                 folder / PICTURE,
@@ -623,14 +632,6 @@ def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
     return np.stack(found)
 
 
-def _nees(sequence: Sequence, prev: Frame | None, step: Step) -> float | None:
-    """Return the squared error of a motion in units of its covariance; None: not known."""
-    T_gt = None if prev is None else true_motion(sequence, prev.index, step.index)
-    if T_gt is None or not step.usable:
-        return None
-    return normalised_error(step.T_curr_prev, T_gt, step.covariance)
-
-
 def _start_of(step: Step, starts: dict[int, Frame]) -> Frame | None:
     """Return the frame from which the motion of a step starts; None of the first step."""
     if step.prev_index is None:
@@ -673,23 +674,6 @@ def _one_line(message: str) -> str:
 
 
 # -- the summary of a run ----------------------------------------------------------------
-
-
-def _score(
-    trajectory: Trajectory,
-    truth: Trajectory,
-    steps: pd.DataFrame,
-    alignment: Any,
-    summary: dict[str, Any],
-) -> dict[str, Any]:
-    """Return the content of ``metrics.json``: the errors of the path and of the motions."""
-    path_errors = evaluate(trajectory, truth, alignment=alignment)
-    # The first frame has no motion.
-    motions = steps[1:].rename(columns={"motion_ms": "ms"})
-    motion_errors = pair_scores(pair_table(motions))
-    repeated = {key: summary[key] for key in RUN_FIELDS}
-    reasons = path_errors["reasons"] | motion_errors["reasons"]
-    return path_errors | motion_errors | repeated | {"reasons": reasons}
 
 
 def _title(summary: dict[str, Any]) -> str:

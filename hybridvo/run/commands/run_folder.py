@@ -288,9 +288,9 @@ def _is_unknown(value: Any) -> bool:
 
 def weights_hash(method: str, models: Models) -> str | None:
     """Return the SHA-256 of the weights that a method uses; None without a network."""
-    from hybridvo.pipeline import NETWORKS
+    from hybridvo.pipeline import method_of
 
-    files = [models.path(name) for name in NETWORKS.get(method, ())]
+    files = [models.path(name) for name in method_of(method).networks]
     if not files:
         return None
     content = b"".join(path.read_bytes() for path in files)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from hybridvo.core import laboratory
 from hybridvo.run.commands.terminal import printable_content, table
 
 Content = Mapping[str, Any]
@@ -35,7 +36,8 @@ def text_of(command: str, content: Content) -> str:
     Returns:
         Lines for the terminal; empty where there is nothing but JSON.
     """
-    write = WRITERS.get(command, _files_text)
+    write = WRITERS.get(command) or laboratory.find(laboratory.TEXTS, command)
+    write = write or _files_text
     return "\n".join(write(printable_content(content)))
 
 
@@ -254,64 +256,7 @@ def _error(report: Content, label: str, key: str, factor: float, unit: str) -> s
     return _labelled(label, f"{factor * value:.4g} {unit}")
 
 
-# -- compare and demo --------------------------------------------------------------------
-
-
-def _compare_text(content: Content) -> list[str]:
-    """Show the short table of a comparison, and where its results lie."""
-    # imported here, because the report needs heavy libraries
-    from hybridvo.lab.evaluation.report import summary_rows
-
-    return [
-        table(summary_rows(content["totals"])),
-        "",
-        "wrong: failed, or an EPE above the limit: 1 px, "
-        "or what the ground truth itself errs by if that is more",
-        *_without_errors(content["totals"]),
-        *_not_run(content["missing"]),
-        *_protocol_means(content["protocol"]),
-        "",
-        *content["files"],
-    ]
-
-
-def _without_errors(totals: list[Content]) -> list[str]:
-    """State why the table has no errors, and what is known without them."""
-    if any(total["pairs_scored"] for total in totals):
-        return []
-    failed = [
-        f"{total['method']} {total['failed']} of {total['pairs']}"
-        for total in totals
-    ]
-    return [
-        "no errors: no pair has ground truth, or none was estimated; "
-        f"motions that failed: {', '.join(failed)}"
-    ]
-
-
-def _protocol_means(protocol: Content | None) -> list[str]:
-    """Show the figures of a protocol beside the published ones, and why some are missing."""
-    if protocol is None:
-        return []
-    from hybridvo.lab.evaluation.report import protocol_rows
-
-    lines = ["", f"protocol {protocol['name']}: {protocol['note']}"]
-    rows = protocol_rows(protocol)
-    for row in rows:
-        # too wide for a terminal
-        del row["inputs"]
-    if rows:
-        lines.append(table(rows))
-        lines.append("what each method was given: report.tex and report.md")
-    for total in protocol["totals"]:
-        reasons = dict.fromkeys(total["reasons"].values())
-        lines += [f"{total['method']}: {reason}" for reason in reasons]
-    return lines
-
-
-def _not_run(missing: Content) -> list[str]:
-    """List the methods that did not run, and why."""
-    return [f"not run: {reason}" for reason in reasons_of(missing)]
+# -- methods that cannot run ------------------------------------------------------------
 
 
 def reasons_of(missing: Mapping[str, str]) -> list[str]:
@@ -329,36 +274,6 @@ def reasons_of(missing: Mapping[str, str]) -> list[str]:
         reason = reason.removeprefix(f"method '{name}' cannot run here: ")
         names.setdefault(reason, []).append(name)
     return [f"{', '.join(group)}: {reason}" for reason, group in names.items()]
-
-
-def _demo_text(content: Content) -> list[str]:
-    """Show the table of the demo, and what to try next."""
-    scene = content["scene"]
-    moving = 100 * content["moving_fraction"]
-    return [
-        f"{scene['frames']} rendered frames of {scene['width']}x{scene['height']}, "
-        f"{moving:.0f} % of the pixels move by themselves; "
-        "flow: OpenCV DIS on the images; depth: the renderer's (true).",
-        "ATE after aligning the first pose, the other errors are means a pair.",
-        "",
-        table([_demo_row(row) for row in content["rows"]]),
-        "",
-        *content["doubts"],
-        f"report: {content['report']}",
-        "next:  hybridvo run DIR       your own sequence (hybridvo init DIR writes camera.yaml)",
-        "       hybridvo doctor DIR    what is wrong with it",
-    ]
-
-
-def _demo_row(row: Content) -> dict[str, str]:
-    """Return a row of the demo's table as texts."""
-
-    def as_text(value: Any) -> str:
-        if value is None:
-            return "-"
-        return value if isinstance(value, str) else f"{value:.4g}"
-
-    return {name: as_text(value) for name, value in row.items()}
 
 
 # -- doctor ------------------------------------------------------------------------------
@@ -499,8 +414,6 @@ WRITERS: dict[str, Callable[[Content], list[str]]] = {
     "run": _run_text,
     "live": _live_text,
     "evaluate": _evaluate_text,
-    "compare": _compare_text,
-    "demo": _demo_text,
     "doctor": _doctor_text,
     "topics": _topics_text,
     "convert": _convert_text,

@@ -39,8 +39,8 @@ class BatchedPose:
         evidence: (B, 3) of which the calibrated probability is a function; None without it.
 
     >>> import hybridvo as hvo
-    >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
-    >>> pair, _ = make_pair("moving30", 0, 108, 256)
+    >>> prev, curr, _ = hvo.example_frames()
+    >>> pair = hvo.FramePair(prev, curr, hvo.dis_flow()(prev, curr).flow)
     >>> batch = hvo.PairBatch.from_pairs([pair, pair])
     >>> motion = hvo.refine(batch, noise=(0.5, 0.02))
     >>> motion.SE3.shape, motion.covariance.shape

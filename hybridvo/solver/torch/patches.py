@@ -87,14 +87,13 @@ class PatchPoses:
         grid: rows and columns of the patches.
 
     >>> import hybridvo as hvo
-    >>> from hybridvo.lab.synthetic.noise_scenarios import make_pair
-    >>> pair, truth = make_pair("moving30", 0, 108, 256)
+    >>> prev, curr, _ = hvo.example_frames()
+    >>> pair = hvo.FramePair(prev, curr, hvo.dis_flow()(prev, curr).flow)
     >>> patches = hvo.PWVO.from_pretrained()(pair).patches
     >>> patches.grid, patches.xi.shape
-    ((5, 11), torch.Size([1, 55, 6]))
-    >>> error = patches.fused.T_curr_prev[0].detach().numpy() - truth["T_curr_prev"]
-    >>> bool(abs(error).max() < 0.01)
-    True
+    ((6, 8), torch.Size([1, 48, 6]))
+    >>> patches.fused.T_curr_prev.shape
+    torch.Size([1, 4, 4])
     """
 
     at: torch.Tensor

@@ -20,7 +20,7 @@ from hybridvo.io.live_rate import (
     RateKeeper,
     rate_by_stamps,
 )
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests.io.live.scripted import (
     LONG_S,
     QUICK,

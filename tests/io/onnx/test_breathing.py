@@ -12,13 +12,13 @@ from hybridvo import Frame, Odometry
 from hybridvo.core.geometry import chain, invert, se3_exp
 from hybridvo.core.options import DepthOptions, Options
 from hybridvo.core.results import RelativePose, Step
-from hybridvo.lab.synthetic.scenes import make_scene
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
     in_one_scale,
     measured_scale,
     scale_factors,
 )
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests.worlds import world
 
 FRAMES = 40

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.scenes import make_scene
 from tests import bags
 
 FRAMES = 6

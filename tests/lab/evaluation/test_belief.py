@@ -9,13 +9,13 @@ import pytest
 from scipy.stats import chi2
 
 from hybridvo.core.geometry import se3_exp
-from hybridvo.lab.evaluation.belief import (
+from hybridvo.core.results import stated_sigmas
+from hybridvo_lab.evaluation.belief import (
     belief_rows,
     normalised_error,
     reliability,
-    stated_sigmas,
 )
-from hybridvo.lab.evaluation.scores import pair_table
+from hybridvo_lab.evaluation.scores import pair_table
 
 
 def pair(status: str = "ok", error: float = 0.1, **more: Any) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import make_transform, se3_exp
 from hybridvo.core.trajectory import Trajectory, read_trajectory
-from hybridvo.lab.evaluation.metrics import ate, evaluate, kitti_drift, match, rpe
+from hybridvo_lab.evaluation.metrics import ate, evaluate, kitti_drift, match, rpe
 from tests.walks import chained
 
 

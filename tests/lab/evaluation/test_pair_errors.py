@@ -8,7 +8,7 @@ import pytest
 
 from hybridvo.core.geometry import ego_flow, invert, make_transform
 from hybridvo.core.types import Camera
-from hybridvo.lab.evaluation.scores import pair_errors, pair_factors
+from hybridvo_lab.evaluation.scores import pair_errors, pair_factors
 
 CAMERA = Camera(200.0, 200.0, 127.5, 63.5, 128, 256)
 """Camera of the paper's size, principal point in the middle: nothing is resized."""

@@ -18,18 +18,18 @@ from hybridvo.core.geometry import make_transform
 from hybridvo.core.options import FlowOptions, Options, RunOptions
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.data.open import open_sequence
-from hybridvo.lab.evaluation import protocols
-from hybridvo.lab.evaluation.metrics import Match
-from hybridvo.lab.evaluation.path_scores import (
+from hybridvo.run.commands import arguments
+from hybridvo_lab.commands.compare import compare
+from hybridvo_lab.evaluation import protocols
+from hybridvo_lab.evaluation.metrics import Match
+from hybridvo_lab.evaluation.path_scores import (
     evaluate_path,
     inverse_rpe,
     score_path,
     total_rows,
 )
-from hybridvo.lab.synthetic.render import write_sintel
-from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.run.commands import arguments
-from hybridvo.run.commands.compare import compare
+from hybridvo_lab.synthetic.render import write_sintel
+from hybridvo_lab.synthetic.scenes import make_scene
 
 D = 0.1
 """Height of the corners of a square above or below its plane, metres."""

@@ -12,9 +12,9 @@ import pytest
 from hybridvo.core.geometry import ego_flow, make_transform
 from hybridvo.core.options import FlowOptions, Options
 from hybridvo.core.types import Camera
-from hybridvo.lab.evaluation.protocols import pairs_summary, protocols
-from hybridvo.lab.evaluation.scores import same_intrinsics
-from hybridvo.run.commands.compare import compare
+from hybridvo_lab.commands.compare import compare
+from hybridvo_lab.evaluation.protocols import pairs_summary, protocols
+from hybridvo_lab.evaluation.scores import same_intrinsics
 
 TAG = struct.pack("<f", 202021.25)
 HEIGHT, WIDTH, FRAMES = 32, 64, 5

@@ -13,10 +13,10 @@ import pytest
 
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.trajectory import Trajectory
-from hybridvo.lab.evaluation.metrics import evaluate
-from hybridvo.lab.evaluation.protocols import pairs_summary, protocols
-from hybridvo.lab.evaluation.report import write_report
-from hybridvo.lab.evaluation.scores import (
+from hybridvo_lab.evaluation.metrics import evaluate
+from hybridvo_lab.evaluation.protocols import pairs_summary, protocols
+from hybridvo_lab.evaluation.report import write_report
+from hybridvo_lab.evaluation.scores import (
     pair_table,
     sequence_row,
     total_row,

@@ -12,9 +12,9 @@ import pytest
 from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Camera
-from hybridvo.lab.calibration import TRUTH_NOISE
-from hybridvo.lab.evaluation.metrics import evaluate, rpe_over_a_second
-from hybridvo.lab.evaluation.scores import (
+from hybridvo_lab.calibration import TRUTH_NOISE
+from hybridvo_lab.evaluation.metrics import evaluate, rpe_over_a_second
+from hybridvo_lab.evaluation.scores import (
     pair_table,
     sequence_row,
     total_row,

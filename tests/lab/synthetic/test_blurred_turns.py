@@ -9,7 +9,7 @@ import pytest
 from hybridvo.core.geometry import ego_flow
 from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.providers import dis_flow
-from hybridvo.lab.synthetic.blurred_turns import Recorded, draw_blurred_turn
+from hybridvo_lab.synthetic.blurred_turns import Recorded, draw_blurred_turn
 
 SIZE = (240, 320)
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, *SIZE)

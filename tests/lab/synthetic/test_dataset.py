@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hybridvo.core.errors import FormatError, InputError
-from hybridvo.lab.synthetic import dataset
-from hybridvo.lab.synthetic.draws import STORED, sample_generator
-from hybridvo.lab.synthetic.paper_samples import PaperOptions
-from hybridvo.lab.synthetic.training_scenes import DiverseOptions
+from hybridvo_lab.synthetic import dataset
+from hybridvo_lab.synthetic.draws import STORED, sample_generator
+from hybridvo_lab.synthetic.paper_samples import PaperOptions
+from hybridvo_lab.synthetic.training_scenes import DiverseOptions
 
 SIZE = {"height": 32, "width": 64}
 

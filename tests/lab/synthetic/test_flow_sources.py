@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hybridvo.core.types import Camera, Frame
-from hybridvo.lab.synthetic import flow_sources
-from hybridvo.lab.synthetic.flow_sources import (
+from hybridvo_lab.synthetic import flow_sources
+from hybridvo_lab.synthetic.flow_sources import (
     DISTURBANCES,
     ESTIMATORS,
     draw_disturbed_flow,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hybridvo.core.geometry import ego_flow, rotation_angle
-from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, Scenario, make_pair
+from hybridvo_lab.synthetic.noise_scenarios import SCENARIOS, Scenario, make_pair
 
 CLEAN = Scenario(moving=0.3, flow_noise_px=0.0, depth_noise=0.0, outliers=0.0)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from hybridvo.core.errors import FormatError, InputError
-from hybridvo.lab.synthetic.dataset import PRESETS, load_preset, read_yaml
-from hybridvo.lab.synthetic.paper_samples import PaperOptions
-from hybridvo.lab.synthetic.training_scenes import DiverseOptions
+from hybridvo_lab.synthetic.dataset import PRESETS, load_preset, read_yaml
+from hybridvo_lab.synthetic.paper_samples import PaperOptions
+from hybridvo_lab.synthetic.training_scenes import DiverseOptions
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 

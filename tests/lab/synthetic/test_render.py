@@ -13,14 +13,14 @@ from hybridvo.core.geometry import ego_flow, invert, pixel_grid
 from hybridvo.core.types import Camera
 from hybridvo.io.data.image_io import read_cam, read_depth, read_flow, read_rgb
 from hybridvo.io.data.sequence import Sequence
-from hybridvo.lab.synthetic.raycast import BOX, ELLIPSOID
-from hybridvo.lab.synthetic.render import (
+from hybridvo_lab.synthetic.raycast import BOX, ELLIPSOID
+from hybridvo_lab.synthetic.render import (
     Scene,
     Solid,
     SyntheticSequence,
     write_sintel,
 )
-from hybridvo.lab.synthetic.scenes import FAMILIES, HEAVY, make_scene
+from hybridvo_lab.synthetic.scenes import FAMILIES, HEAVY, make_scene
 
 CAMERA = Camera(20.0, 20.0, 10.0, 5.0, 11, 21)
 

@@ -7,7 +7,7 @@ import pytest
 
 from hybridvo.core import geometry
 from hybridvo.core.types import Camera
-from hybridvo.lab.synthetic import paper_samples, sensors, training_scenes
+from hybridvo_lab.synthetic import paper_samples, sensors, training_scenes
 
 
 def generator(index: int, seed: int = 3) -> np.random.Generator:

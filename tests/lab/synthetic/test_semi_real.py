@@ -11,9 +11,9 @@ import pytest
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow
 from hybridvo.core.types import Camera, Frame
-from hybridvo.lab.synthetic import semi_real
-from hybridvo.lab.synthetic.meshes import Canvas
-from hybridvo.lab.synthetic.semi_real import (
+from hybridvo_lab.synthetic import semi_real
+from hybridvo_lab.synthetic.meshes import Canvas
+from hybridvo_lab.synthetic.semi_real import (
     OBJECT_KINDS,
     SPLITS,
     Recording,

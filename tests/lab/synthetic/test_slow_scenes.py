@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.lab.synthetic.slow_scenes import (
+from hybridvo_lab.synthetic.scenes import make_scene
+from hybridvo_lab.synthetic.slow_scenes import (
     slow_scene,
     slowed_down,
     structured_light,

@@ -7,11 +7,11 @@ import numpy as np
 
 from hybridvo.core.geometry import make_transform
 from hybridvo.core.types import Camera
-from hybridvo.lab.synthetic import training_scenes
-from hybridvo.lab.synthetic.bodies import moving_object, stairs
-from hybridvo.lab.synthetic.paper_samples import camera_flow
-from hybridvo.lab.synthetic.render import Scene
-from hybridvo.lab.synthetic.training_scenes import render_pair, training_scene
+from hybridvo_lab.synthetic import training_scenes
+from hybridvo_lab.synthetic.bodies import moving_object, stairs
+from hybridvo_lab.synthetic.paper_samples import camera_flow
+from hybridvo_lab.synthetic.render import Scene
+from hybridvo_lab.synthetic.training_scenes import render_pair, training_scene
 
 
 def generator(seed: int) -> np.random.Generator:

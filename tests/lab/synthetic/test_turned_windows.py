@@ -11,7 +11,7 @@ import pytest
 from hybridvo.core.geometry import ego_flow, rotation_angle
 from hybridvo.core.types import Camera
 from hybridvo.flow.providers import dis_flow
-from hybridvo.lab.synthetic.turned_windows import (
+from hybridvo_lab.synthetic.turned_windows import (
     TripodRecording,
     draw_turned_window,
     load_tripod,

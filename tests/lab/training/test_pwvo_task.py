@@ -11,10 +11,13 @@ import torch
 
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.euler import euler_motion
-from hybridvo.lab.training import hypothesis_samples
-from hybridvo.lab.training.hypothesis_samples import Makers, draw_samples
-from hybridvo.lab.training.options import PWVOTrainingOptions, load_training_options
-from hybridvo.lab.training.pwvo_task import (
+from hybridvo.network.hypothesis_maps import HypothesisMaps
+from hybridvo.network.models import load_weights
+from hybridvo.network.pwvo import PWVOOptions
+from hybridvo_lab.training import hypothesis_samples
+from hybridvo_lab.training.hypothesis_samples import Makers, draw_samples
+from hybridvo_lab.training.options import PWVOTrainingOptions, load_training_options
+from hybridvo_lab.training.pwvo_task import (
     HypothesisBatch,
     PWVOTask,
     TwoLooks,
@@ -22,10 +25,7 @@ from hybridvo.lab.training.pwvo_task import (
     read_batches,
     refits_of,
 )
-from hybridvo.lab.training.trainer import Trainer
-from hybridvo.network.hypothesis_maps import HypothesisMaps
-from hybridvo.network.models import load_weights
-from hybridvo.network.pwvo import PWVOOptions
+from hybridvo_lab.training.trainer import Trainer
 
 CONFIG = Path(__file__).parents[3] / "configs" / "train_pwvo.yaml"
 

@@ -15,15 +15,15 @@ import torch
 from torch import distributed
 
 from hybridvo.core.errors import InputError
-from hybridvo.lab.synthetic.dataset import Mixture
-from hybridvo.lab.training.options import PaperTrainingOptions, PWVOTrainingOptions
-from hybridvo.lab.training.paper_task import PaperTask
-from hybridvo.lab.training.pwvo_task import PWVOTask
-from hybridvo.lab.training.trainer import Trainer, read_checkpoint
-from hybridvo.network import ranks
-from hybridvo.network.paper.layers import NetworkOptions
-from hybridvo.network.paper.losses import LossOptions
 from hybridvo.network.pwvo import PWVOOptions
+from hybridvo_lab.paper.layers import NetworkOptions
+from hybridvo_lab.paper.losses import LossOptions
+from hybridvo_lab.synthetic.dataset import Mixture
+from hybridvo_lab.training import ranks
+from hybridvo_lab.training.options import PaperTrainingOptions, PWVOTrainingOptions
+from hybridvo_lab.training.paper_task import PaperTask
+from hybridvo_lab.training.pwvo_task import PWVOTask
+from hybridvo_lab.training.trainer import Trainer, read_checkpoint
 from tests.lab.training.test_tools import write_config
 
 PAPER = PaperTrainingOptions(

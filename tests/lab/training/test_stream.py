@@ -5,13 +5,13 @@ import itertools
 import pytest
 import torch
 
-from hybridvo.lab.synthetic.draws import (
+from hybridvo_lab.synthetic.draws import (
     HELD_OUT,
     STORED,
     TRAINING,
     sample_generator,
 )
-from hybridvo.lab.training.paper_task import sample_stream
+from hybridvo_lab.training.paper_task import sample_stream
 
 
 def flows(loader, count: int) -> list[torch.Tensor]:

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from hybridvo.core.errors import CheckpointError
-from hybridvo.lab.synthetic.dataset import read_yaml
-from hybridvo.lab.training.options import load_paper_options, load_training_options
-from hybridvo.lab.training.trainer import export_run
 from hybridvo.network.models import PWVO_KIND, load_weights
 from hybridvo.run import cli
+from hybridvo_lab.synthetic.dataset import read_yaml
+from hybridvo_lab.training.options import load_paper_options, load_training_options
+from hybridvo_lab.training.trainer import export_run
 
 ROOT = Path(__file__).parents[3]
 

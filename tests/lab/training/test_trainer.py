@@ -11,18 +11,18 @@ import pytest
 import torch
 
 from hybridvo.core.errors import CheckpointError, DegenerateError, InputError
-from hybridvo.lab.synthetic.dataset import Mixture
-from hybridvo.lab.synthetic.paper_samples import PaperOptions
-from hybridvo.lab.training.options import (
+from hybridvo_lab.paper.layers import NetworkOptions
+from hybridvo_lab.paper.losses import LossOptions
+from hybridvo_lab.synthetic.dataset import Mixture
+from hybridvo_lab.synthetic.paper_samples import PaperOptions
+from hybridvo_lab.training.options import (
     OptimizerOptions,
     PaperTrainingOptions,
     ScheduleOptions,
 )
-from hybridvo.lab.training.paper_task import PaperTask, sample_stream
-from hybridvo.lab.training.trainer import Trainer
-from hybridvo.lab.training.validation import TrainingBatch
-from hybridvo.network.paper.layers import NetworkOptions
-from hybridvo.network.paper.losses import LossOptions
+from hybridvo_lab.training.paper_task import PaperTask, sample_stream
+from hybridvo_lab.training.trainer import Trainer
+from hybridvo_lab.training.validation import TrainingBatch
 
 TINY = PaperTrainingOptions(
     network=NetworkOptions(width=0.1, head_stride=2),

@@ -6,12 +6,12 @@ import torch
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.results import PixelwisePrediction
-from hybridvo.lab.synthetic.draws import sample_generator
-from hybridvo.lab.synthetic.paper_samples import PaperOptions
-from hybridvo.lab.training import validation
-from hybridvo.lab.training.validation import TrainingBatch, collate
-from hybridvo.network.paper.layers import NetworkOptions
-from hybridvo.network.paper.networks import build_network
+from hybridvo_lab.paper.layers import NetworkOptions
+from hybridvo_lab.paper.networks import build_network
+from hybridvo_lab.synthetic.draws import sample_generator
+from hybridvo_lab.synthetic.paper_samples import PaperOptions
+from hybridvo_lab.training import validation
+from hybridvo_lab.training.validation import TrainingBatch, collate
 
 PRESET = PaperOptions(height=32, width=64)
 

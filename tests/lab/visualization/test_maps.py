@@ -12,18 +12,18 @@ from hybridvo.api import estimate
 from hybridvo.core.types import FramePair
 from hybridvo.flow.colours import flow_colours
 from hybridvo.flow.providers import dis_flow, with_flow
-from hybridvo.lab.synthetic.render import SyntheticSequence, write_sintel
-from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.lab.visualization.pair import (
-    moving_pixels,
-    pair_panels,
-)
-from hybridvo.lab.visualization.saliency import (
-    integrated_gradients,
-)
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.weights import save_weights
 from hybridvo.run.cli import main
+from hybridvo_lab.synthetic.render import SyntheticSequence, write_sintel
+from hybridvo_lab.synthetic.scenes import make_scene
+from hybridvo_lab.visualization.pair import (
+    moving_pixels,
+    pair_panels,
+)
+from hybridvo_lab.visualization.saliency import (
+    integrated_gradients,
+)
 
 # -- flow in colours ------------------------------------------------------------------------------
 

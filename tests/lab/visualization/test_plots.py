@@ -10,7 +10,7 @@ import pytest
 from hybridvo.core.errors import OutputError
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.trajectory import Trajectory
-from hybridvo.lab.visualization.trajectory import plot_trajectory
+from hybridvo_lab.visualization.trajectory import plot_trajectory
 from tests.walks import chained
 
 

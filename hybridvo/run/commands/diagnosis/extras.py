@@ -21,6 +21,7 @@ EXTRAS = {
     "oak": Extra("live OAK cameras", ("depthai",)),
     "orbbec": Extra("live Orbbec cameras", ("pyorbbecsdk",)),
     "onnx": Extra("depth, flow and masks by networks", ("onnxruntime",)),
+    "lab": Extra("compare, demo, show, train, errors of a run", ("hybridvo_lab",)),
     "evaluation": Extra("errors of paths: ATE and RPE", ("evo",)),
     "report": Extra("report.html of compare", ("plotly", "jinja2")),
     "viz": Extra("--view and --rrd: a run in the Rerun viewer", ("rerun",)),

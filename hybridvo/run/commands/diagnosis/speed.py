@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridvo.core import laboratory
 from hybridvo.core.errors import InputError
 from hybridvo.core.stages import (
     LATE_PERCENTILE,
@@ -18,8 +19,6 @@ from hybridvo.core.stages import (
 )
 from hybridvo.core.types import Frame
 from hybridvo.io.data.sequence import Sequence
-from hybridvo.lab.synthetic.scenes import make_scene
-from hybridvo.run.commands.demo import HEIGHT, SCENE, WIDTH
 from hybridvo.tracking.odometry import Odometry
 
 # frames that are tracked, of the demo a third: some seconds
@@ -103,10 +102,11 @@ def _read(sequence: Sequence) -> Iterator[Frame]:
 
 def _rendered() -> list[Frame]:
     """The frames of the demo; drawing them is no reading."""
-    scene = make_scene(
-        SCENE, 0, height=HEIGHT, width=WIDTH, frames=SPEED_FRAMES // 3
+    draw = laboratory.wanted(
+        laboratory.FUNCTIONS, "demo_frames", "'--speed' without DIR"
     )
-    return [scene.render(index) for index in range(scene.frames)]
+    frames: list[Frame] = draw(SPEED_FRAMES // 3)
+    return frames
 
 
 def _load() -> float | None:

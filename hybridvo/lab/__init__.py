@@ -1,1 +1,0 @@
-"""Scenes, training, evaluation and pictures: nothing that estimates needs it."""

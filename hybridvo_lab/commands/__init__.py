@@ -1,0 +1,1 @@
+"""Commands of the laboratory, which ``hybridvo`` offers where it is installed."""

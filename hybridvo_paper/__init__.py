@@ -1,1 +1,0 @@
-"""Weights of the six networks of the PWVO paper, which hybridvo finds by their names."""
