@@ -41,6 +41,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.network.pwvo import PWVO as PWVO
     from hybridvo.network.selection import select as select
     from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
+    from hybridvo.solver.torch.tools import PoseSeed as PoseSeed
     from hybridvo.tracking.chains import chain_covariance as chain_covariance
     from hybridvo.tracking.chains import to_g2o_information as to_g2o_information
     from hybridvo.tracking.inertial import gyro_prior as gyro_prior
@@ -62,6 +63,7 @@ _HOME = {
         "core.options": "Options",
         "core.errors": "InputError",
         "solver.torch.batched_pose": "BatchedPose",
+        "solver.torch.tools": "PoseSeed",
         "network.pwvo": "PWVO",
         "network.selection": "select",
         "tracking.odometry": "Odometry",

@@ -101,8 +101,6 @@ def refine(
     T_init: Any = None,
     weights: Any = None,
     *,
-    lead: Any = None,
-    seed_covariance: Any = None,
     noise: Any = None,
     kernel: str | None = None,
     options: Options | None = None,
@@ -115,8 +113,6 @@ def refine(
     T_init: Any = None,
     weights: Any = None,
     *,
-    lead: Any = None,
-    seed_covariance: Any = None,
     noise: Any = None,
     kernel: str | None = None,
     options: Options | None = None,
@@ -131,21 +127,16 @@ def refine(
     For a batch the motion is differentiable: gradients reach flow, depth, intrinsics, variances,
     weights and ``noise``, but not ``T_init``. If ``noise`` is given, this is the gradient of
     the solution; if it is estimated, the gradient treats it as constant. There are no second
-    derivatives. If the tensors from ``select`` are passed on unchanged, the probability is the
-    same as that of the method ``pwvo-refine``.
+    derivatives. From the seed of ``select`` the probability is that of the method ``pwvo-refine``.
 
     Args:
         pair: a FramePair, or a PairBatch of torch tensors.
         T_init: T_curr_prev, metres. For a pair, (4, 4): the only starting point; there is no
-            search. For a batch, (B, 4, 4), or (B, S, 4, 4) for several candidates: with weights,
-            the only starting points.
+            search. For a batch, a :class:`PoseSeed`, (B, 4, 4), or (B, S, 4, 4) for several
+            candidates: with weights, the only starting points. Without the covariance of a seed
+            the search is confined to about a pixel, or more if hardly any pixel fits that well.
         weights: (H, W), for a batch (B, H, W): factors on the information of each pixel; 0 or
             NaN excludes a pixel.
-        lead: for a batch, (B,): ``select(maps).lead``, if the seed was modified or is only a
-            part of it.
-        seed_covariance: for a batch, (B, 6, 6): covariance of the left perturbation of
-            ``T_init``; m^2, m rad, rad^2. The search is confined to this region around
-            ``T_init``; None: to about a pixel, or more if hardly any pixel fits that well.
         noise: for a batch, (2,) or (B, 2): standard deviations of the flow, px, and of log depth;
             None: estimated.
         kernel: for a batch: ``geman-mcclure`` (default), ``cauchy``, ``huber`` or ``l2``.
@@ -174,8 +165,6 @@ def refine(
             pair,
             T_init,
             weights,
-            lead=lead,
-            seed_covariance=seed_covariance,
             noise=noise,
             kernel="geman-mcclure" if kernel is None else kernel,
             options=options.refine,
@@ -183,8 +172,6 @@ def refine(
         )
     check_kind("refine.pair", pair, FramePair, PairBatch)
     of_batches = {
-        "lead": lead,
-        "seed_covariance": seed_covariance,
         "noise": noise,
         "kernel": kernel,
     }

@@ -249,8 +249,7 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
         seed = select(with_patches(maps, batch, [hypothesis]))
         motion = refine_batch(
             batch,
-            seed.T_curr_prev,
-            seed.weights,
+            seed,
             options=ctx.options.refine,
             min_probability=ctx.options.select.min_probability,
         )

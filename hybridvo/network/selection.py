@@ -20,8 +20,6 @@ is one of these:
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
 
@@ -31,11 +29,8 @@ from hybridvo.core.euler import euler_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import check_dense
 from hybridvo.solver.torch.tools import (
-    SeedMarks,
-    covariance_of,
-    lead_of,
+    PoseSeed,
     to_tiles,
-    with_marks,
 )
 
 # over the largest weight: pixels of large uncertainty decide only where there are
@@ -60,39 +55,6 @@ IMAGE_DIMENSIONS = 2
 """Height and width."""
 
 
-class PoseSeed(NamedTuple):
-    """Where a refinement starts, and the weights of its pixels.
-
-    Attributes:
-        T_curr_prev: (B, 4, 4) motion, metres; it carries the ``lead``.
-        weights: (B, H, W) in (0, 1], with the gradient of the rotation's log scales; None
-            without uncertainty.
-    """
-
-    T_curr_prev: torch.Tensor
-    weights: torch.Tensor | None
-
-    @property
-    def lead(self) -> torch.Tensor | None:
-        """Log odds that the motion chosen is the camera's, (B,).
-
-        It is None without uncertainty. ``refine`` takes it from ``T_curr_prev``, as
-        evidence for its probability. With a part or a copy of the seed, pass it to
-        ``refine`` as ``lead=``.
-        """
-        return lead_of(self.T_curr_prev)
-
-    @property
-    def covariance(self) -> torch.Tensor | None:
-        """Covariance (B, 6, 6) of the left perturbation of the motion; m^2, m rad, rad^2.
-
-        It is None without patches. ``refine`` takes it from ``T_curr_prev``, and seeks the
-        motion where it states. With a part or a copy of the seed, pass it to ``refine`` as
-        ``seed_covariance=``.
-        """
-        return covariance_of(self.T_curr_prev)
-
-
 def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
     """Select the start of a refinement, with weights from the uncertainty.
 
@@ -103,7 +65,8 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
             patches ``softmax``.
 
     Returns:
-        The motions (B, 4, 4), and the weights (B, H, W) of their pixels.
+        The motions (B, 4, 4), and the weights (B, H, W) of their pixels, in (0, 1], with the
+        gradient of the rotation's log scales; None without uncertainty.
 
     Raises:
         InputError: the maps are no prediction, or the method is unknown.
@@ -135,8 +98,7 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
         return PoseSeed(T, None)
     # without a margin, the network was used for one motion only: no evidence either way
     lead = T.new_zeros(len(T)) if maps.lead is None else maps.lead
-    with_marks(T, SeedMarks(lead.detach(), covariance))
-    return PoseSeed(T, seed_weights(maps))
+    return PoseSeed(T, seed_weights(maps), lead.detach(), covariance)
 
 
 def _of_patches(

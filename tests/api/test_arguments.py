@@ -171,7 +171,7 @@ test_functions = refuses(
                           "sparse": torch.eye(4).to_sparse()}.items()),
         *((f"refine {name} of a pair", lambda name=name: hvo.refine(PAIR, **{name: 1}), InputError,
            (f"refine.{name}", "PairBatch.from_pairs"))
-          for name in ("noise", "kernel", "lead", "seed_covariance")),
+          for name in ("noise", "kernel")),
         ("no such method", lambda: hvo.estimate(PAIR, method="refin"), InputError,
          ("refin", "classical")),
         *((f"tracker seed {v!r}", lambda v=v: tracker(seed=v), InputError, ("seed",))
@@ -265,7 +265,7 @@ test_batches = refuses(
            ("refine_batch", "T_init", "expected", "got")) for name, v in BAD_STARTS.items()),
         *((f"weights {name}", lambda v=v: hvo.refine(BATCH, EYES, v), InputError,
            ("refine_batch", "weights", "expected", "got")) for name, v in BAD_WEIGHTS.items()),
-        *((f"lead {name}", lambda v=v: hvo.refine(BATCH, EYES, ONES, lead=v), InputError,
+        *((f"lead {name}", lambda v=v: hvo.refine(BATCH, hvo.PoseSeed(EYES, ONES, v)), InputError,
            ("refine_batch", "lead", "expected", "got"))
           for name, v in {"text": "x", "of three": torch.ones(3), "one": 1.0}.items()),
         *((f"noise {name}", lambda v=v: hvo.refine(BATCH, noise=v), InputError,

@@ -101,7 +101,7 @@ def test_a_pair_without_data_is_uncertain_and_changes_no_other(
     seed = select(maps)
     assert torch.isfinite(seed.T_curr_prev).all()
     torch.testing.assert_close(seed.T_curr_prev[1].float(), torch.eye(4))
-    motion = refine(batch, seed.T_curr_prev, seed.weights)
+    motion = refine(batch, seed)
     assert not motion.status[1].usable
 
 
@@ -293,7 +293,7 @@ def answer(
     with torch.no_grad():
         maps = network(batch)
         seed = select(maps)
-        motion = refine(batch, seed.T_curr_prev, seed.weights)
+        motion = refine(batch, seed)
     said = {name: getattr(maps, name) for name in MAPS}
     for name in ("xi", "information", "share", "agreement"):
         said[f"patches, {name}"] = getattr(maps.patches, name)

@@ -29,7 +29,7 @@ def four_lines(pairs, device="cpu", dtype=torch.float32):
     batch = hvo.PairBatch.from_pairs(pairs, device, dtype)
     maps = hvo.PWVO.from_pretrained().to(device)(batch)
     seed = hvo.select(maps)
-    return hvo.refine(batch, seed.T_curr_prev, seed.weights)
+    return hvo.refine(batch, seed)
 
 
 def check(motion, pairs) -> None:
@@ -84,9 +84,7 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
     def loss(flow, depth_prev, log_scale):
         changed = hvo.PairBatch(flow, depth_prev, batch.K_prev, batch.K_curr)
         seed = hvo.select(replace(maps, log_scale=log_scale))
-        motion = hvo.refine(
-            changed, seed.T_curr_prev, seed.weights, noise=(0.3, 0.02)
-        )
+        motion = hvo.refine(changed, seed, noise=(0.3, 0.02))
         return (C * motion.T_curr_prev[0]).sum()
 
     leaves = {k: v.clone().requires_grad_() for k, v in values.items()}
@@ -110,7 +108,7 @@ def test_compiled_programs_may_call_them(pairs) -> None:
 
     def lines(batch: hvo.PairBatch):
         seed = hvo.select(network(batch))
-        return hvo.refine(batch, seed.T_curr_prev, seed.weights)
+        return hvo.refine(batch, seed)
 
     found = torch.compile(lines, backend="eager")(batch)
     expected = lines(batch)
@@ -167,7 +165,7 @@ def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
     # nothing agrees with a motion so little that the network is no surer of it than of another
     batch = hvo.PairBatch.from_pairs([pairs[0][0]])
     seed = hvo.select(hvo.PWVO.from_pretrained()(batch))
-    unsure = hvo.refine(batch, seed.T_curr_prev, seed.weights, lead=torch.zeros(1))
+    unsure = hvo.refine(batch, seed._replace(lead=torch.zeros(1)))
     assert float(unsure.probability[0]) < 0.75
     assert unsure.status[0].reason is hvo.Reason.AMBIGUOUS_MOTION
 

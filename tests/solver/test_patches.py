@@ -198,13 +198,18 @@ def test_a_seed_carries_the_covariance_of_its_patches_into_refine(
     _, batch, maps = predicted
     seed = hvo.select(maps)
     torch.testing.assert_close(seed.covariance, maps.patches.fused.covariance)
-    carried = hvo.refine(batch, seed.T_curr_prev, seed.weights)
-    T = seed.T_curr_prev.clone()
-    told = hvo.refine(
-        batch, T, seed.weights, lead=seed.lead, seed_covariance=seed.covariance
-    )
-    torch.testing.assert_close(carried.T_curr_prev, told.T_curr_prev)
-    torch.testing.assert_close(carried.probability, told.probability)
+    carried = hvo.refine(batch, seed)
+    # a copy of the pose is as good as the pose
+    copied = hvo.refine(batch, seed._replace(T_curr_prev=seed.T_curr_prev.clone()))
+    assert torch.equal(carried.T_curr_prev, copied.T_curr_prev)
+    assert torch.equal(carried.probability, copied.probability)
+    # a part of the seed is the seed of a part
+    second = hvo.PairBatch.from_pairs([predicted[0][1][0]])
+    alone = hvo.refine(second, seed.part(slice(1, None)))
+    torch.testing.assert_close(alone.T_curr_prev, carried.T_curr_prev[1:])
+    torch.testing.assert_close(alone.probability, carried.probability[1:])
+    with pytest.raises(InputError, match="weights once"):
+        hvo.refine(batch, seed, seed.weights)
 
 
 def test_every_selection_of_patches_has_a_name(predicted) -> None:
@@ -230,7 +235,7 @@ def test_a_solution_outside_of_the_region_leaves_the_seed_and_says_so() -> None:
     sure = torch.from_numpy(np.diag([1e-3**2] * 3 + [1e-4**2] * 3))[None]
     weights = torch.rand(1, *SIZE, generator=torch.Generator().manual_seed(0))
     start = torch.from_numpy(seed)[None]
-    found = hvo.refine(batch, start, weights + 0.5, seed_covariance=sure)
+    found = hvo.refine(batch, hvo.PoseSeed(start, weights + 0.5, covariance=sure))
     assert found.status[0].reason is Reason.SOLVER_DIVERGED
     assert "seed" in found.status[0].message
     np.testing.assert_allclose(found.T_curr_prev[0].numpy(), seed, atol=1e-6)
@@ -238,5 +243,7 @@ def test_a_solution_outside_of_the_region_leaves_the_seed_and_says_so() -> None:
     away = se3_log(T @ np.linalg.inv(seed))
     C = found.covariance[0].numpy()
     assert away @ np.linalg.solve(C, away) / 6 < 2
-    free = hvo.refine(batch, start, weights + 0.5, seed_covariance=1e4 * sure)
+    free = hvo.refine(
+        batch, hvo.PoseSeed(start, weights + 0.5, covariance=1e4 * sure)
+    )
     np.testing.assert_allclose(free.T_curr_prev[0].numpy(), T, atol=3e-3)

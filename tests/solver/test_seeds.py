@@ -11,6 +11,7 @@ from hybridvo.core.torch_geometry import se3
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.backend import refine_batch
+from hybridvo.solver.torch.tools import PoseSeed
 from tests import worlds
 
 NOISE = (0.3, 0.005)
@@ -44,9 +45,15 @@ def error_px(pair: FramePair, T: np.ndarray, T_true: np.ndarray) -> float:
     )
 
 
-def refined(batch: PairBatch, pair: FramePair, T: np.ndarray, **how) -> np.ndarray:
+def refined(
+    batch: PairBatch,
+    pair: FramePair,
+    T: np.ndarray,
+    covariance: torch.Tensor | None = None,
+) -> np.ndarray:
     start = torch.from_numpy(T)[None]
-    found = refine_batch(batch, start, uneven_weights(pair), **how)
+    seed = PoseSeed(start, uneven_weights(pair), covariance=covariance)
+    found = refine_batch(batch, seed)
     return found.T_curr_prev[0].double().numpy()
 
 
@@ -80,9 +87,9 @@ def test_the_covariance_of_a_seed_states_how_far_the_motion_is_sought() -> None:
         torch.from_numpy(np.diag([std**2] * 3 + [(0.2 * std) ** 2] * 3))[None]
         for std in (0.005, 0.5)
     )
-    near = refined(batch, pair, seed, seed_covariance=small)
+    near = refined(batch, pair, seed, small)
     assert error_px(pair, near, T) < 0.1
-    away = refined(batch, pair, seed, seed_covariance=large)
+    away = refined(batch, pair, seed, large)
     assert error_px(pair, away, T) > 2
 
 

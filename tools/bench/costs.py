@@ -171,7 +171,7 @@ def batches(seed0: int) -> list[dict[str, Any]]:
         motion = maps.motion.detach().requires_grad_()
         log_scale = maps.log_scale.detach().requires_grad_()
         start = select(replace(maps, motion=motion, log_scale=log_scale))
-        pose = refine(batch, start.T_curr_prev, start.weights).T_curr_prev
+        pose = refine(batch, start).T_curr_prev
         pose.square().sum().backward()
 
     rows = []

@@ -36,6 +36,7 @@ from hybridvo.core.geometry import pose_matrix
 from hybridvo.network.pair_maps import Look, look_at_pair
 from hybridvo.network.selection import seed_weights
 from hybridvo.solver.torch.patches import PatchPoses, patch_poses
+from hybridvo.solver.torch.tools import PoseSeed
 from hybridvo_lab.synthetic.paper_samples import KnownPair
 from hybridvo_lab.synthetic.scenes import HEAVY
 from hybridvo_lab.training.validation import allowed_error_px
@@ -198,13 +199,10 @@ def errors_of(known: KnownPair, static: StaticPart, look: Look) -> dict[str, Any
     refined = {}
     for name, start_of in ROWS.items():
         start = start_of(pair)
-        motion = refine(
-            pair.batch,
-            start.T_curr_prev,
-            start.weights,
-            lead=pair.lead,
-            seed_covariance=start.covariance,
+        seed = PoseSeed(
+            start.T_curr_prev, start.weights, pair.lead, start.covariance
         )
+        motion = refine(pair.batch, seed)
         starts[name] = error(start.T_curr_prev[0])
         refined[name] = error(motion.T_curr_prev[0])
     patches = pair.patches

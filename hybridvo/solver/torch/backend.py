@@ -32,10 +32,9 @@ from hybridvo.solver.torch.factors import KERNELS, Pixels, ResidualModel
 from hybridvo.solver.torch.solve import Starts, solve
 from hybridvo.solver.torch.status import StartEvidence, judged_batch
 from hybridvo.solver.torch.tools import (
+    PoseSeed,
     as_tensor,
     checked_batch,
-    covariance_of,
-    lead_of,
     uncompiled,
 )
 
@@ -55,8 +54,6 @@ def refine_batch(
     T_init: Any = None,
     weights: Any = None,
     *,
-    lead: Any = None,
-    seed_covariance: Any = None,
     noise: Any = None,
     kernel: str = "geman-mcclure",
     options: RefineOptions | None = None,
@@ -73,16 +70,13 @@ def refine_batch(
 
     Args:
         batch: see :class:`~hybridvo.core.types.PairBatch`.
-        T_init: (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, metres; one that is not finite
-            is replaced by the identity. Without weights the identity is one more start.
-        weights: (B, H, W) factors on the information; pixels whose factor is not positive and
-            finite are not used. They count squared until the motion is chosen.
-        lead: (B,) log odds that ``T_init`` is the camera's motion, by the network that it and the
-            weights come from; None: what ``select`` marked ``T_init`` with.
-        seed_covariance: (B, 6, 6) of the left perturbation of ``T_init``; m^2, m rad, rad^2: how
-            far from it the motion is sought; None: about a pixel, more where hardly any pixel fits
-            it. The identity that stands in for a missing start has none: from there the motion is
-            sought far away.
+        T_init: a :class:`PoseSeed`; or (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, metres;
+            one that is not finite is replaced by the identity. Without weights the identity is one
+            more start. Where the seed states no covariance the motion is sought within about a
+            pixel, or more where hardly any pixel fits it. The identity that stands in for a missing
+            start has none: from there the motion is sought far away.
+        weights: (B, H, W) factors on the information, unless the seed has some; pixels whose factor
+            is not positive and finite are not used. They count squared until the motion is chosen.
         noise: standard deviations of flow, px, and of log depth, as (2,) or (B, 2); None:
             estimated, and held constant for the gradient.
         kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
@@ -99,18 +93,16 @@ def refine_batch(
     check_kind("refine_batch.batch", batch, PairBatch)
     check_kind("refine_batch.options", options, RefineOptions)
     model = kernel_model(kernel, options)
-    lead = lead_of(T_init) if lead is None else lead
-    if seed_covariance is None:
-        seed_covariance = covariance_of(T_init)
-    batch, weights = checked_batch(batch, weights)
-    with_identity = T_init is None or weights is None
-    T_starts = _initial_poses(T_init, batch.flow, with_identity)
+    seed = _seed_of(T_init, weights)
+    batch, weights = checked_batch(batch, seed.weights)
+    with_identity = seed.T_curr_prev is None or weights is None
+    T_starts = _initial_poses(seed.T_curr_prev, batch.flow, with_identity)
     is_seed = [True] * T_starts.shape[1]
     is_seed[0] = not with_identity
-    covariance = _given_covariance(seed_covariance, batch.flow)
+    covariance = _given_covariance(seed.covariance, batch.flow)
     starts = Starts(T_starts, is_seed, covariance)
-    if T_init is None or weights is None:
-        lead = None  # it belongs to a start and its weights
+    # it belongs to a start and its weights
+    lead = None if with_identity else seed.lead
     noise = given_noise(noise, batch.flow)
     start_evidence = StartEvidence(
         T_starts[:, 0],
@@ -144,6 +136,18 @@ def kernel_model(kernel: Any, options: RefineOptions) -> ResidualModel:
         )
     cutoff = KERNEL_CUTOFFS.get(kernel, options.cutoff)
     return ResidualModel(torch.empty(0), cutoff, kernel)
+
+
+def _seed_of(T_init: Any, weights: Any) -> PoseSeed:
+    """The start as it was handed in, with its weights."""
+    if not isinstance(T_init, PoseSeed):
+        return PoseSeed(T_init, weights)
+    if weights is not None and T_init.weights is not None:
+        raise InputError(
+            "refine_batch: expected weights once, got some beside those of the seed; leave one "
+            "out, as with seed._replace(weights=None)."
+        )
+    return T_init if weights is None else T_init._replace(weights=weights)
 
 
 def _needs_gradient(
@@ -206,7 +210,9 @@ def _given_covariance(value: Any, like: torch.Tensor) -> torch.Tensor | None:
     """Return the covariance (B, 6, 6) of a start as handed in, or None."""
     if value is None:
         return None
-    covariance = as_tensor(value, "seed_covariance", like.device).detach().double()
+    covariance = (
+        as_tensor(value, "PoseSeed.covariance", like.device).detach().double()
+    )
     expected = (len(like), 6, 6)
     is_valid = tuple(covariance.shape) == expected
     if is_valid:
@@ -214,8 +220,8 @@ def _given_covariance(value: Any, like: torch.Tensor) -> torch.Tensor | None:
         is_valid = bool((variances >= 0).all() and torch.isfinite(covariance).all())
     if not is_valid:
         raise InputError(
-            f"refine_batch: expected seed_covariance of shape {expected}, finite, with variances "
-            f"that are not negative, got {tuple(covariance.shape)}."
+            f"refine_batch: expected PoseSeed.covariance of shape {expected}, finite, with "
+            f"variances that are not negative, got {tuple(covariance.shape)}."
         )
     return covariance
 
@@ -224,11 +230,11 @@ def _given_lead(lead: Any, like: torch.Tensor) -> torch.Tensor | None:
     """Return the lead (B,) as handed in, or None."""
     if lead is None:
         return None
-    value = as_tensor(lead, "lead", like.device).detach().double()
+    value = as_tensor(lead, "PoseSeed.lead", like.device).detach().double()
     if value.shape != like.shape[:1]:
         shape = f"({len(like)},)"
         raise InputError(
-            f"refine_batch: expected lead of shape {shape}, got {tuple(value.shape)}."
+            f"refine_batch: expected PoseSeed.lead of shape {shape}, got {tuple(value.shape)}."
         )
     return torch.nan_to_num(value, 0.0, 0.0, 0.0)
 

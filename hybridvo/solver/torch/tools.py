@@ -17,37 +17,45 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class SeedMarks(NamedTuple):
-    """What a start of a refinement carries beside its motions.
+class PoseSeed(NamedTuple):
+    """Where the refinement of a batch starts, and what is known of the start.
 
     Attributes:
-        lead: (B,) by how much the score of its network exceeds that of any other motion.
-        covariance: (B, 6, 6) of its left perturbation; m^2, m rad, rad^2; None: not stated.
+        T_curr_prev: (B, 4, 4), metres; or (B, S, 4, 4), several starts.
+        weights: (B, H, W) factors on the information of each pixel; None: all alike.
+        lead: (B,) log odds that the motion is the camera's, by the network that it and the weights
+            come from: evidence for the probability of the answer; None: not known.
+        covariance: (B, 6, 6) of the left perturbation of the motion; m^2, m rad, rad^2: how far
+            from it the motion is sought; None: not stated.
+
+    Example:
+        >>> import torch
+        >>> import hybridvo as hvo
+        >>> seed = hvo.PoseSeed(torch.eye(4).expand(3, 4, 4), lead=torch.zeros(3))
+        >>> seed.part(slice(1, None)).T_curr_prev.shape
+        torch.Size([2, 4, 4])
     """
 
-    lead: torch.Tensor
+    T_curr_prev: torch.Tensor
+    weights: torch.Tensor | None = None
+    lead: torch.Tensor | None = None
     covariance: torch.Tensor | None = None
 
+    def part(self, samples: slice | torch.Tensor) -> PoseSeed:
+        """Return the seed of some samples.
 
-def with_marks(T: torch.Tensor, marks: SeedMarks) -> torch.Tensor:
-    """Mark the start T (B, 4, 4), and return it.
+        Args:
+            samples: which ones, as an index of the first axis: a slice, numbers, or a mask.
 
-    ``refine_batch`` finds the marks on this very tensor; a changed copy has none.
-    """
-    T.seed_marks = marks  # type: ignore[attr-defined]
-    return T
-
-
-def lead_of(T: Any) -> torch.Tensor | None:
-    """Return the lead that a start is marked with, or None."""
-    marks = getattr(T, "seed_marks", None)
-    return None if marks is None else marks.lead
-
-
-def covariance_of(T: Any) -> torch.Tensor | None:
-    """Return the covariance that a start is marked with, or None."""
-    marks = getattr(T, "seed_marks", None)
-    return None if marks is None else marks.covariance
+        Returns:
+            Their seed, in that order.
+        """
+        return PoseSeed(
+            self.T_curr_prev[samples],
+            None if self.weights is None else self.weights[samples],
+            None if self.lead is None else self.lead[samples],
+            None if self.covariance is None else self.covariance[samples],
+        )
 
 
 def has_torch_geometry() -> bool:
