@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridvo import Camera
 from hybridvo.core.errors import FormatError
-from hybridvo.io.data.streams import Images, StreamSequence
+from hybridvo.io.data.streams import FrameImages, StreamSequence
 
 FRAMES = 6
 BAD = 2
@@ -91,8 +91,8 @@ class EvilSequence(StreamSequence):
         self.timestamps = np.arange(FRAMES) / 30
         self._camera = Camera(40, 40, 15.5, 11.5, 24, 32)
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         if index == BAD:
             DEEDS[self.chosen["deed"]]()
         rgb = np.full((24, 32, 3), index, np.uint8)
-        return Images(rgb, np.full((24, 32), 1 + index, np.float32))
+        return FrameImages(rgb, np.full((24, 32), 1 + index, np.float32))

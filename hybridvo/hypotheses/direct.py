@@ -168,7 +168,7 @@ def _judged(
     at = planes.at(motion.T_curr_prev)
     images = compare_points(pair, planes, at, motion)
     follows = following(images, at, cutoff)
-    view = _View(planes, images, follows, pair.prev.camera.width, is_refined)
+    view = _SeenPoints(planes, images, follows, pair.prev.camera.width, is_refined)
     std_px = ego_flow_std(pair, planes.points[images.inside], motion)
     evidence = view.evidence(std_px)
     count = max(int(np.count_nonzero(images.inside)), 1)
@@ -187,7 +187,7 @@ def _judged(
     return judged.replace(weights=weights)
 
 
-class _View(NamedTuple):
+class _SeenPoints(NamedTuple):
     """What the images show of a motion at the points of the depth maps."""
 
     planes: PlaneFactor
@@ -219,7 +219,7 @@ class _View(NamedTuple):
 def _by_belief(
     pair: FramePair,
     motion: RelativePose,
-    view: _View,
+    view: _SeenPoints,
     std_px: float,
     belief: Belief,
 ) -> RelativePose:

@@ -33,7 +33,7 @@ from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.torch.tools import has_torch_geometry, uncompiled
 
 
-class Look(NamedTuple):
+class PairLook(NamedTuple):
     """The surest hypothesis of a pair.
 
     Attributes:
@@ -114,7 +114,7 @@ def look_at_pair(
     options: Options | None = None,
     seed: int = 0,
     starts: Sequence[np.ndarray] = (),
-) -> Look | None:
+) -> PairLook | None:
     """Look at every hypothesis of a pair, and return the surest; None where there is none.
 
     Motions (4, 4) to start from are tried beside the identity and the prior.
@@ -134,7 +134,7 @@ def look_at_pair(
     inputs = scorer.pair_inputs.with_hypotheses(
         best.pose[None], np.array([best.stats.noise]), [0]
     )
-    return Look(maps_of_best(scorer, [ranking]), inputs, best)
+    return PairLook(maps_of_best(scorer, [ranking]), inputs, best)
 
 
 def maps_of_best(

@@ -30,7 +30,7 @@ from hybridvo.solver.shared_errors import (
 MAD_TO_STD = 1.4826
 
 
-class View(NamedTuple):
+class Tiling(NamedTuple):
     """Where pixels lie in an image: in which tile, and each tile in which part."""
 
     tile_of: np.ndarray  # (N,) int32 tile of each pixel
@@ -48,7 +48,7 @@ class Information(NamedTuple):
     agreement: float
 
 
-def view_of(shape: tuple[int, int], index: np.ndarray, tiles: int) -> View:
+def view_of(shape: tuple[int, int], index: np.ndarray, tiles: int) -> Tiling:
     """Assign pixels to the tiles of an image, and these to its parts.
 
     Args:
@@ -60,7 +60,7 @@ def view_of(shape: tuple[int, int], index: np.ndarray, tiles: int) -> View:
     rows = -(-shape[0] // size)
     columns = -(-shape[1] // size)
     tile_of = index[:, 0] // size * columns + index[:, 1] // size
-    return View(tile_of.astype(np.int32), parts_of_tiles(rows, columns))
+    return Tiling(tile_of.astype(np.int32), parts_of_tiles(rows, columns))
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -82,7 +82,7 @@ def estimate_information(rows, weights, shared, products, view, even_parts):
         shared: (K, N) float32 change of the residuals by each of K independent
             errors that whole parts of the image share.
         products: (1 + M, 1 + M) sums of the weighted products of the rows.
-        view: a :class:`View`.
+        view: a :class:`Tiling`.
         even_parts: dispersion of the parts' scores, as a fraction of the model's, below
             which they agree; 0: they are not compared, and the motion is the optimum of
             these residuals alone, from which no other terms pull it away.
@@ -137,7 +137,7 @@ def sum_scores(rows, weights, shared, step, view):
         shared: (K, N) float32.
         step: (M,) from the unknowns at which the rows were taken to the optimum; to
             first order it corrects the residuals.
-        view: a :class:`View`.
+        view: a :class:`Tiling`.
 
     Returns:
         The sums (1 + K, tiles, M) of the scores of the residuals, then of the shared

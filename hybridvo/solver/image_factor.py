@@ -19,7 +19,7 @@ from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.image_kernels import (
     GREY_NOISE_FLOOR,
-    Images,
+    ComparedImages,
     compare_images,
     fill_pixels,
     sum_images,
@@ -31,7 +31,7 @@ from hybridvo.solver.newton import (
     Factor,
     FactorSum,
     Linearization,
-    State,
+    MotionState,
     newton,
     robust_linearization,
 )
@@ -124,7 +124,7 @@ class ImageFactor:
         camera = [curr.fx, curr.fy, curr.cx, curr.cy, 1 / prev.fx, 1 / prev.fy]
         pixels = gather_pixels(pair.prev, weights, index)
         gradient = pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
-        self._images = Images(
+        self._images = ComparedImages(
             pixels,
             blurred(pair.curr),
             np.array(camera, np.float32),
@@ -181,7 +181,7 @@ class ImageFactor:
         others: Sequence[Factor[Linearization]],
         T_curr_prev: np.ndarray,
         steps: int,
-    ) -> State:
+    ) -> MotionState:
         """Return the motion after some Newton steps, with the gain and offset there.
 
         Args:
@@ -190,7 +190,7 @@ class ImageFactor:
             T_curr_prev: (4, 4) to start from.
             steps: most of them.
         """
-        start = State(np.array(T_curr_prev), at.gain_offset)
+        start = MotionState(np.array(T_curr_prev), at.gain_offset)
         factor = FactorSum([self.under(at), *others])
         return newton(factor, start, steps, IMAGE_TOLERANCE).state
 
@@ -198,13 +198,13 @@ class ImageFactor:
 class NoisyImages(NamedTuple):
     """The images as a factor, under a known noise."""
 
-    images: Images
+    images: ComparedImages
     noise: np.ndarray  # (2,) float32 standard deviations, see weigh_pixels
     rows: np.ndarray  # (12, N) float32 to work in, see ImageRow
     weights: np.ndarray  # (N,) float32 to work in
     information_scale: float  # factor on the information of these residuals
 
-    def linearize(self, state: State) -> Linearization:
+    def linearize(self, state: MotionState) -> Linearization:
         """Return the normal equations of motion, gain and offset."""
         return robust_linearization(*sum_images(self, *state))
 

@@ -27,7 +27,7 @@ from hybridvo.solver.calibration import (
 )
 from hybridvo.solver.correlated_errors import (
     Information,
-    View,
+    Tiling,
     estimate_information,
     robust_std,
 )
@@ -49,7 +49,7 @@ MIN_AREA = np.float32(MIN_PATCH_AREA)
 HALF = np.float32(0.5)
 
 
-class Images(NamedTuple):
+class ComparedImages(NamedTuple):
     """Two images that are compared: pixels of one, and the other."""
 
     pixels: np.ndarray  # (8, N) float32, see PixelRow
@@ -57,7 +57,7 @@ class Images(NamedTuple):
     camera: np.ndarray  # (6,) float32, see project_pixels
     squared_cutoff: np.float32  # of the robust kernel
     contrast: float  # root mean square of the gradients of the pixels
-    places: View  # where the pixels lie in the previous image
+    places: Tiling  # where the pixels lie in the previous image
 
 
 class Differences(NamedTuple):
@@ -355,7 +355,7 @@ def compare_images(images, T, gain_offset, noise):
     """Return the :class:`Differences` of two images at a motion.
 
     Args:
-        images: an :class:`Images`.
+        images: an :class:`ComparedImages`.
         T: (4, 4) T_curr_prev.
         gain_offset: (2,) gain and offset so far.
         noise: (2,) float32 standard deviations so far, see :func:`weigh_pixels`.

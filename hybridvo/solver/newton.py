@@ -41,16 +41,16 @@ MAX_NEXT_STEP2 = 0.5
 UNCHANGED_LIGHT = np.array([1.0, 0.0])
 
 
-class State(NamedTuple):
+class MotionState(NamedTuple):
     """What the factors of a pair depend on."""
 
     T_curr_prev: np.ndarray  # (4, 4)
     # (2,) gain of the current image over the previous one, offset in grey levels
     gain_offset: np.ndarray = UNCHANGED_LIGHT
 
-    def moved(self, delta: np.ndarray) -> State:
+    def moved(self, delta: np.ndarray) -> MotionState:
         """Return the state after a step: (6,) of the motion, or (8,) with gain and offset."""
-        return State(*moved(self.T_curr_prev, self.gain_offset, delta))
+        return MotionState(*moved(self.T_curr_prev, self.gain_offset, delta))
 
 
 @dataclass(eq=False)
@@ -89,7 +89,7 @@ L_co = TypeVar("L_co", bound=Linearization, covariant=True)
 class Factor(Protocol[L_co]):
     """A part of the cost of a motion."""
 
-    def linearize(self, state: State) -> L_co:
+    def linearize(self, state: MotionState) -> L_co:
         """Return the normal equations at a state."""
         ...
 
@@ -100,7 +100,7 @@ class FactorSum:
     def __init__(self, factors: Sequence[Factor[Linearization]]) -> None:
         self._factors = factors
 
-    def linearize(self, state: State) -> Linearization:
+    def linearize(self, state: MotionState) -> Linearization:
         """Return the normal equations of all factors at a state."""
         first, *others = (factor.linearize(state) for factor in self._factors)
         H = first.H.copy()
@@ -125,7 +125,7 @@ class NewtonResult(Generic[L_co]):
             is none.
     """
 
-    state: State
+    state: MotionState
     at: L_co
     iterations: int
     last2: float
@@ -139,7 +139,7 @@ class _Step(NamedTuple):
 
 
 def newton(
-    factor: Factor[L_co], start: State, iterations: int, tolerance: float
+    factor: Factor[L_co], start: MotionState, iterations: int, tolerance: float
 ) -> NewtonResult[L_co]:
     """Find the state of least cost by damped Newton steps.
 
@@ -163,7 +163,7 @@ def newton(
         ...         away[:3] = state.T_curr_prev[:3, 3] - [1.0, 2.0, 3.0]
         ...         nothing = np.zeros((6, 6))
         ...         return Linearization(np.eye(6), -away, away @ away / 2, nothing)
-        >>> newton(Distance(), State(np.eye(4)), 3, 1e-3).state.T_curr_prev[:3, 3].round(5)
+        >>> newton(Distance(), MotionState(np.eye(4)), 3, 1e-3).state.T_curr_prev[:3, 3].round(5)
         array([1., 2., 3.])
     """
     state = start

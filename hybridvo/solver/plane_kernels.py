@@ -20,7 +20,7 @@ from hybridvo.solver.calibration import (
 )
 from hybridvo.solver.correlated_errors import (
     Information,
-    View,
+    Tiling,
     estimate_information,
     robust_std,
 )
@@ -65,7 +65,7 @@ class Surfaces(NamedTuple):
     quantum: (
         float  # step of the sensor over depth squared, 1 / m; 0: it does not round
     )
-    places: View  # where the points lie in the previous image
+    places: Tiling  # where the points lie in the previous image
 
 
 class Distances(NamedTuple):

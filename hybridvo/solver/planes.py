@@ -23,7 +23,7 @@ from hybridvo.solver.calibration import MIN_EQUAL_DEPTHS, QUANTUM_PERCENTILE
 from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.newton import (
     Linearization,
-    State,
+    MotionState,
     positive_inverse,
     robust_linearization,
 )
@@ -221,7 +221,7 @@ class NoisyPlanes(NamedTuple):
     weights: np.ndarray  # (N,) float32 to work in
     information_scale: float  # factor on the information; 0: they are not used
 
-    def linearize(self, state: State) -> Linearization:
+    def linearize(self, state: MotionState) -> Linearization:
         """Return the normal equations of the motion."""
         return robust_linearization(*sum_planes(self, state.T_curr_prev))
 

@@ -9,7 +9,7 @@ import numpy as np
 from hybridvo.compiled.numba_tools import njit
 from hybridvo.core.geometry import invert
 from hybridvo.solver.calibration import PRIOR_FREEDOM
-from hybridvo.solver.newton import Linearization, State
+from hybridvo.solver.newton import Linearization, MotionState
 from hybridvo.solver.rows import MOTION_TERMS
 
 # of the weights of the prior, which its Hessian leaves out
@@ -42,7 +42,7 @@ class Prior(NamedTuple):
             *prior_terms(self.T_prev_curr, self.information, T_curr_prev)
         )
 
-    def linearize(self, state: State) -> Linearization:
+    def linearize(self, state: MotionState) -> Linearization:
         """Return the normal equations at a state."""
         at = self.at(state.T_curr_prev)
         return Linearization(at.information, at.g, at.cost, NO_CURVATURE)

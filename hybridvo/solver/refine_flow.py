@@ -33,8 +33,8 @@ from hybridvo.solver.kernels import (
 from hybridvo.solver.newton import (
     ROUNDED_STEP_STD,
     Linearization,
+    MotionState,
     NewtonResult,
-    State,
     newton,
     tile_size,
 )
@@ -120,7 +120,7 @@ class FlowFactor:
     tile: int
     scores: ScoreProducts
 
-    def linearize(self, state: State) -> FlowLinearization:
+    def linearize(self, state: MotionState) -> FlowLinearization:
         """Return the normal equations at a state."""
         sums = self.grid.full_pass(state.T_curr_prev[:3], self.noise, self.tile)
         total = sums.tiles.sum(axis=(0, 1))
@@ -247,7 +247,9 @@ def _fit_full_grid(
     )
     tile = tile_size(grid.size, options.tiles)
     flow = FlowFactor(grid, weighting, tile, scores)
-    fit = newton(flow, State(pose_matrix(pose)), FULL_STEPS, STEP_TOLERANCE_STD)
+    fit = newton(
+        flow, MotionState(pose_matrix(pose)), FULL_STEPS, STEP_TOLERANCE_STD
+    )
     return fit, int(steps)
 
 

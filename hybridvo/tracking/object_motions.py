@@ -104,7 +104,7 @@ class Earlier(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class GridView:
     """A frame on the grid of a belief, and the frames before that show what moves.
 
     Attributes:
@@ -241,7 +241,7 @@ class Region(NamedTuple):
 
 
 def moving_regions(
-    view: View, expected: Sequence[Expected], options: Options, seed: int = 0
+    view: GridView, expected: Sequence[Expected], options: Options, seed: int = 0
 ) -> list[Region]:
     """Find what moves by itself in a frame.
 
@@ -265,7 +265,7 @@ def moving_regions(
     return _Segmentation(view, scene, expected, options, seed).regions()
 
 
-def _suspected(view: View) -> np.ndarray:
+def _suspected(view: GridView) -> np.ndarray:
     """(h, w) cells that may move, by images and depth without flow."""
     points = view.points
     cells = points.on_grid(view.stillness < -SUSPECTED) > 0
@@ -413,7 +413,7 @@ class _FlowedPart:
     variance: np.ndarray
 
     @classmethod
-    def around(cls, view: View, cells: np.ndarray) -> _FlowedPart | None:
+    def around(cls, view: GridView, cells: np.ndarray) -> _FlowedPart | None:
         """The part around some cells; None where it has no flow."""
         box = box_of(view.mask_of(cells) > 0, MARGIN_PX)
         box = with_centre(box, view.frame.camera)
@@ -473,7 +473,7 @@ class _Segmentation:
 
     def __init__(
         self,
-        view: View,
+        view: GridView,
         scene: _FlowedPart,
         expected: Sequence[Expected],
         options: Options,

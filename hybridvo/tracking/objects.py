@@ -47,8 +47,8 @@ from hybridvo.tracking.object_motions import (
     MOST,
     Expected,
     Fit,
+    GridView,
     Region,
-    View,
     moving_regions,
 )
 
@@ -138,7 +138,7 @@ class _Ahead(NamedTuple):
 @stage("objects")
 def after_step(
     things: Things | None,
-    view: View,
+    view: GridView,
     frames: int,
     options: Options,
     seed: int = 0,
@@ -190,7 +190,7 @@ def after_step(
     )
 
 
-def _ahead(thing: Thing, view: View, frames: int) -> _Ahead:
+def _ahead(thing: Thing, view: GridView, frames: int) -> _Ahead:
     """An object at constant velocity."""
     T_camera = view.before.T_curr_prev
     T_own = se3_exp(frames * se3_log(thing.T_own))
@@ -209,7 +209,7 @@ def _ahead(thing: Thing, view: View, frames: int) -> _Ahead:
 
 
 def _assigned(
-    ahead: Sequence[_Ahead], regions: Sequence[Region], view: View
+    ahead: Sequence[_Ahead], regions: Sequence[Region], view: GridView
 ) -> dict[int, _Ahead]:
     """The object that each region is taken for, by the number of the region."""
     if not ahead or not regions:
@@ -225,7 +225,7 @@ def _assigned(
     }
 
 
-def _likeness(ahead: _Ahead, region: Region, view: View) -> float:
+def _likeness(ahead: _Ahead, region: Region, view: GridView) -> float:
     """How well a region fits an object, 0 to 1: by overlap, or by nearness after it was hidden."""
     points = _points_in(region.cells, view)
     if not len(points):
@@ -247,7 +247,7 @@ def _likeness(ahead: _Ahead, region: Region, view: View) -> float:
     return float(MIN_OVERLAP * (1 - apart / reach))
 
 
-def _points_in(cells: np.ndarray, view: View) -> np.ndarray:
+def _points_in(cells: np.ndarray, view: GridView) -> np.ndarray:
     """(N, 3) float32 points of some cells."""
     inside = cells[view.points.cells]
     return view.points.xyz[inside].astype(np.float32)
@@ -269,7 +269,7 @@ def first_log_odds(fraction: float) -> float:
 
 
 def _seen(
-    number: int, before: _Ahead | None, region: Region, view: View, frames: int
+    number: int, before: _Ahead | None, region: Region, view: GridView, frames: int
 ) -> Thing | None:
     """An object in a frame that shows it; None where too little is left of it."""
     points = _points_in(region.cells, view)
@@ -291,7 +291,7 @@ def _seen(
 
 
 def _velocity(
-    before: _Ahead | None, fit: Fit, view: View, frames: int
+    before: _Ahead | None, fit: Fit, view: GridView, frames: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The motion (4, 4) of an object in one frame, as measured and as before, with covariance."""
     T_camera = view.before.T_curr_prev
@@ -322,7 +322,7 @@ def _hidden(ahead: _Ahead, frames: int) -> Thing | None:
     )
 
 
-def _stated(thing: Thing, region: Region, view: View) -> MovingObject:
+def _stated(thing: Thing, region: Region, view: GridView) -> MovingObject:
     """What a step states of an object that is seen."""
     mask = view.mask_of(region.cells) > MOST
     fit = region.fit
@@ -341,7 +341,7 @@ def _stated(thing: Thing, region: Region, view: View) -> MovingObject:
     )
 
 
-def _stated_hidden(thing: Thing, ahead: _Ahead, view: View) -> MovingObject:
+def _stated_hidden(thing: Thing, ahead: _Ahead, view: GridView) -> MovingObject:
     """What a step states of an object that is hidden."""
     status = Status.failed(
         Reason.LOW_INLIERS, f"not seen for {thing.hidden} frames; motion expected"

@@ -409,7 +409,7 @@ def moving_objects(
     if not (frame.is_rgbd and reference.frame.is_rgbd):
         return None
     from hybridvo.tracking import objects
-    from hybridvo.tracking.object_motions import Earlier, View
+    from hybridvo.tracking.object_motions import Earlier, GridView
 
     T_cam_world = invert(estimate.T_world_cam)
     starts = (*estimate.keyframes, estimate.start)
@@ -418,7 +418,7 @@ def moving_objects(
     if oldest.count < reference.count and oldest.frame.depth is not None:
         far = Earlier(oldest.frame, T_cam_world @ oldest.T_world_cam)
     before = Earlier(reference.frame, T_cam_world @ reference.T_world_cam)
-    view = View(frame, before, far, estimate.motion.depth_noise)
+    view = GridView(frame, before, far, estimate.motion.depth_noise)
     passed = state.count - reference.count
     context = setup.context
     return objects.after_step(

@@ -27,7 +27,7 @@ from hybridvo_lab.baselines.correspondences import (
 from hybridvo_lab.baselines.solvers import SOLVER_ERRORS
 
 
-class Images(NamedTuple):
+class PairImages(NamedTuple):
     """Both images and depth maps of a pair, with the previous intrinsics."""
 
     rgb: list[np.ndarray]  # (H, W, 3) uint8, previous and current
@@ -35,7 +35,7 @@ class Images(NamedTuple):
 
 
 def align_opencv(
-    images: Images, camera: Camera, max_depth: float
+    images: PairImages, camera: Camera, max_depth: float
 ) -> np.ndarray | None:
     """Call OpenCV 5's ``cv2.Odometry`` with image and depth."""
     settings = cv2.OdometrySettings()
@@ -52,7 +52,7 @@ def align_opencv(
 
 
 def align_open3d(
-    images: Images, camera: Camera, max_depth: float
+    images: PairImages, camera: Camera, max_depth: float
 ) -> np.ndarray | None:
     """Call Open3D's ``compute_rgbd_odometry`` with the hybrid term."""
     import open3d
@@ -80,7 +80,7 @@ def align_open3d(
     return np.asarray(T, dtype=np.float64) if found else None
 
 
-Aligner = Callable[[Images, Camera, float], np.ndarray | None]
+Aligner = Callable[[PairImages, Camera, float], np.ndarray | None]
 ALIGNERS: dict[str, Aligner] = {
     "opencv-rgbd": align_opencv,
     "open3d-rgbd": align_open3d,
@@ -108,14 +108,14 @@ def estimate_by_images(method: str, pair: FramePair, seed: int) -> RelativePose:
     return with_covariance(T, data, camera, OPENCV_INLIER_PX, sigma_px)
 
 
-def _images(pair: FramePair) -> Images:
+def _images(pair: FramePair) -> PairImages:
     """Both images and depth maps, the current ones resampled to the previous K.
 
     Raises:
         StageFailed: where an image is missing, or has no valid depth.
     """
     camera = pair.prev.camera
-    images = Images([], [])
+    images = PairImages([], [])
     for name, frame in (("previous", pair.prev), ("current", pair.curr)):
         if frame.rgb is None:
             raise StageFailed(

@@ -63,25 +63,27 @@ NO_MOVING = (
 )
 
 
-class Factor(NamedTuple):
+class ErrorFactor(NamedTuple):
     """What may explain an error."""
 
     label: str
     edges: tuple[float, ...]  # of the bins of a chart
 
 
-FACTORS: Mapping[str, Factor] = {
-    "dynamic_fraction": Factor(
+FACTORS: Mapping[str, ErrorFactor] = {
+    "dynamic_fraction": ErrorFactor(
         "fraction of pixels that move", (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1)
     ),
-    "flow_magnitude_px": Factor(
+    "flow_magnitude_px": ErrorFactor(
         "median true ego flow [px]", (0, 1, 2, 5, 10, 20, 50, math.inf)
     ),
-    "rotation_deg": Factor("true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)),
-    "translation_m": Factor(
+    "rotation_deg": ErrorFactor(
+        "true rotation [deg]", (0, 0.1, 0.3, 1, 3, 10, 180)
+    ),
+    "translation_m": ErrorFactor(
         "true translation [m]", (0, 0.003, 0.01, 0.03, 0.1, 0.3, 1, math.inf)
     ),
-    "depth_spread": Factor(
+    "depth_spread": ErrorFactor(
         "90th over 10th percentile of depth", (1, 1.5, 2, 4, 8, 16, math.inf)
     ),
 }

@@ -49,7 +49,7 @@ class TripodRecording:
     foreground: tuple[np.ndarray, ...]  # (H, W) uint8, 1 where something stands
 
 
-class View(NamedTuple):
+class WindowView(NamedTuple):
     """What a virtual camera sees."""
 
     frame: Frame
@@ -217,7 +217,7 @@ def looking_at(pixel: np.ndarray, camera: Camera) -> np.ndarray:
 
 def view_of_turned(
     frame: Frame, foreground: np.ndarray, R: np.ndarray, window: Camera
-) -> View:
+) -> WindowView:
     """Return what a camera of the same centre sees.
 
     Args:
@@ -242,4 +242,4 @@ def view_of_turned(
     depth = cv2.remap(frame.depth, columns, rows, cv2.INTER_NEAREST)
     depth = (depth / turned[..., 2]).astype(np.float32)
     seen_foreground = cv2.remap(foreground, columns, rows, cv2.INTER_NEAREST)
-    return View(Frame(rgb, np.maximum(depth, 0), window), seen_foreground > 0)
+    return WindowView(Frame(rgb, np.maximum(depth, 0), window), seen_foreground > 0)

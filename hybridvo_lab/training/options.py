@@ -64,7 +64,7 @@ class ScheduleOptions:
 
 
 @option_group
-class RunOptions:
+class TrainingRun:
     """Options of every training; the defaults are the paper's."""
 
     seed: int = 0
@@ -79,7 +79,7 @@ class RunOptions:
 
 
 @option_group
-class PaperTrainingOptions(RunOptions):
+class PaperTrainingOptions(TrainingRun):
     """Options of a training of PWVO or of a baseline.
 
     ``configs/train_paper.yaml`` explains them.
@@ -119,7 +119,7 @@ class PaperTrainingOptions(RunOptions):
 
 
 @option_group
-class PWVOTrainingOptions(RunOptions):
+class PWVOTrainingOptions(TrainingRun):
     """Options of a training of PWVO.
 
     ``configs/train_pwvo.yaml`` explains them.

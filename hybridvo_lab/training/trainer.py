@@ -34,7 +34,7 @@ from hybridvo_lab.training import ranks
 from hybridvo_lab.training.options import (
     PaperTrainingOptions,
     PWVOTrainingOptions,
-    RunOptions,
+    TrainingRun,
 )
 from hybridvo_lab.training.paper_task import PaperTask
 from hybridvo_lab.training.pwvo_task import PWVOTask
@@ -108,7 +108,7 @@ class Trainer:
     ) -> None:
         self.task = task
         self.folder = folder
-        self.options: RunOptions = task.options
+        self.options: TrainingRun = task.options
         self.device = torch.device(device)
         self.workers = workers
         self.report = report

@@ -102,7 +102,7 @@ def _rows(
 
 
 @dataclass(frozen=True, eq=False)
-class Equations:
+class WindowEquations:
     """The normal equations of a window at its state; n unknowns."""
 
     J: torch.Tensor  # (K, L, n) how the numbers of the edges follow the unknowns

@@ -29,7 +29,7 @@ from hybridvo.solver.torch.solve import BATCH_SCALE_RATIO, BATCH_STEP_TOLERANCE_
 from hybridvo_lab.windows.window_equations import (
     POSE,
     EdgeSums,
-    Equations,
+    WindowEquations,
     edge_inflation,
     edge_jacobians,
     edge_scores,
@@ -38,8 +38,8 @@ from hybridvo_lab.windows.window_equations import (
 from hybridvo_lab.windows.window_poses import WindowPoses
 from hybridvo_lab.windows.window_unknowns import (
     Edges,
-    State,
     Unknowns,
+    WindowState,
     camera_columns,
     moved_pixels,
 )
@@ -160,7 +160,7 @@ class Window:
         self.poses_size = POSE * (self.edges.frames - 1)
         self.stds = unknowns.stds(pixels.weight)
 
-    def starts(self) -> State | None:
+    def starts(self) -> WindowState | None:
         """Poses by the fewest edges from frame 0; None where some frames cannot be reached."""
         T = self.alone.SE3.detach().matrix().double()
         poses = torch.eye(4).to(T).repeat(self.edges.frames, 1, 1)
@@ -177,7 +177,7 @@ class Window:
             return None
         return self._state_at(pp.mat2SE3(poses, check=False))
 
-    def solve(self, state: State) -> WindowPoses:
+    def solve(self, state: WindowState) -> WindowPoses:
         """Return the window from its starts."""
         with torch.no_grad():
             rested = self._rested(state)
@@ -219,7 +219,7 @@ class Window:
             state, torch.block_diag(*blocks), status, False, 0, nothing
         )
 
-    def _rested(self, state: State) -> Rested[State]:
+    def _rested(self, state: WindowState) -> Rested[WindowState]:
         """Where the window comes to rest, from a state."""
         wide = list(self._first_widths(state))
         if wide:
@@ -240,13 +240,15 @@ class Window:
             Rest(self._tolerance),
         )
 
-    def _after(self, state: State, step: torch.Tensor, at: Equations) -> State:
+    def _after(
+        self, state: WindowState, step: torch.Tensor, at: WindowEquations
+    ) -> WindowState:
         """The state after a step (1, n)."""
         return self._moved(state, step[0], at.depth_step(step[0]))
 
     def _result(
         self,
-        state: State,
+        state: WindowState,
         covariance: torch.Tensor,
         status: Status,
         converged: bool,
@@ -287,19 +289,19 @@ class Window:
 
     # --- a state --------------------------------------------------------------------
 
-    def _state_at(self, C: pp.LieTensor) -> State:
+    def _state_at(self, C: pp.LieTensor) -> WindowState:
         """The state at poses (F, 7), with all other unknowns as their priors have them."""
         pixels = self.fixed.weight.shape[1] if self.unknowns.shared_depth else 0
         depths = self.fixed.weight.new_zeros(self.edges.frames, pixels)
-        return State(C, torch.zeros_like(self.stds), depths)
+        return WindowState(C, torch.zeros_like(self.stds), depths)
 
     def _moved(
-        self, state: State, step: torch.Tensor, depths: torch.Tensor
-    ) -> State:
+        self, state: WindowState, step: torch.Tensor, depths: torch.Tensor
+    ) -> WindowState:
         """The state after a step (n,) and one of the depths (F, N)."""
         poses = step[: self.poses_size]
         held = torch.zeros_like(step[:POSE])
-        return State(
+        return WindowState(
             C=left_update(torch.cat([held, poses]).reshape(-1, POSE), state.C),
             others=state.others + step[self.poses_size :],
             depths=state.depths + depths,
@@ -309,7 +311,7 @@ class Window:
         """T_curr_prev (K, 4, 4) of the edges at poses (F, 4, 4)."""
         return C[self.edges.curr] @ torch.linalg.inv(C[self.edges.prev])
 
-    def _motions_at(self, state: State) -> torch.Tensor:
+    def _motions_at(self, state: WindowState) -> torch.Tensor:
         """T_curr_prev (K, 4, 4) of the edges."""
         return self._motions(to_matrix(state.C).double())
 
@@ -328,7 +330,7 @@ class Window:
         """What is added (K, N) to the log depth of the pixels."""
         return self._depth_std(pixels, model) * depths[self.edges.prev]
 
-    def _depth_at(self, state: State) -> torch.Tensor:
+    def _depth_at(self, state: WindowState) -> torch.Tensor:
         """Depth (K, H, W) of the previous frames."""
         longer = self.edges.log_scales(self.unknowns, state.others)
         longer = longer[self.edges.prev, None]
@@ -340,7 +342,7 @@ class Window:
 
     # --- equations ------------------------------------------------------------------
 
-    def _first_widths(self, state: State) -> Iterator[ResidualModel]:
+    def _first_widths(self, state: WindowState) -> Iterator[ResidualModel]:
         """Yield models whose kernel narrows to the noise, from as wide as the residuals are.
 
         Where scales or the focal length are off, edges contradict each other at the start.
@@ -358,7 +360,9 @@ class Window:
             yield self.model._replace(noise=wide)
             width = torch.maximum(width * BATCH_SCALE_RATIO, narrow)
 
-    def _equations(self, state: State, model: ResidualModel) -> Equations:
+    def _equations(
+        self, state: WindowState, model: ResidualModel
+    ) -> WindowEquations:
         """The normal equations at a state."""
         T = self._motions_at(state)
         if self.unknowns.shared_depth:
@@ -368,11 +372,11 @@ class Window:
         else:
             sums = self._edge_sums(state, model)
         J = edge_jacobians(T, self.edges, self.unknowns)
-        return Equations(J, sums, self.edges, state.others, state.depths)
+        return WindowEquations(J, sums, self.edges, state.others, state.depths)
 
     def _edge_sums(
         self,
-        state: State,
+        state: WindowState,
         model: ResidualModel,
         log_depth: torch.Tensor | None = None,
         depth_std: torch.Tensor | None = None,
@@ -390,7 +394,7 @@ class Window:
 
     # --- what is known of the solution ------------------------------------------------
 
-    def _covariance(self, state: State) -> torch.Tensor:
+    def _covariance(self, state: WindowState) -> torch.Tensor:
         """The covariance (n, n) of the unknowns.
 
         Each edge's gradient varies as its own covariance states, whatever the others do.
@@ -414,7 +418,7 @@ class Window:
         scale = torch.cat([before, self.stds])
         return scale[:, None] * (inverse @ meat @ inverse) * scale
 
-    def _disagreement(self, state: State) -> torch.Tensor:
+    def _disagreement(self, state: WindowState) -> torch.Tensor:
         """(K,) squared distance of the edges' own motions from those of the window."""
         T = pp.mat2SE3(self._motions_at(state), check=False)
         away = (self._own_motions(state) @ T.Inv()).Log().tensor()
@@ -422,7 +426,7 @@ class Window:
         distance2 = torch.einsum("ki,kij,kj->k", away, information, away)
         return torch.where(self.edges.used, distance2, torch.nan)
 
-    def _own_motions(self, state: State) -> pp.LieTensor:
+    def _own_motions(self, state: WindowState) -> pp.LieTensor:
         """The motions (K, 7) of the edges alone, at the window's focal length and scales."""
         own = self.alone.SE3.detach().tensor().double()
         if len(self.stds) == 0:
@@ -437,7 +441,7 @@ class Window:
 
     # --- the gradient ---------------------------------------------------------------
 
-    def _with_gradient(self, state: State) -> State:
+    def _with_gradient(self, state: WindowState) -> WindowState:
         """The state with the gradient of the solution, by the implicit function theorem.
 
         The depths are eliminated as in the step: with A = -d(g, g_u) / d(x, u),
@@ -471,7 +475,7 @@ class Window:
 
     def _total_scores(
         self,
-        state: State,
+        state: WindowState,
         away: torch.Tensor,
         deeper: torch.Tensor,
         pixels: Pixels,

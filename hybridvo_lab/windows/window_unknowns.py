@@ -61,7 +61,7 @@ class Unknowns(NamedTuple):
         return torch.cat(parts)
 
 
-class State(NamedTuple):
+class WindowState(NamedTuple):
     """Where a window is: poses, and the unknowns in standard deviations of their priors."""
 
     C: pp.LieTensor  # (F, 7) T_frame_first

@@ -17,12 +17,12 @@ from hybridvo.run.cli import main
 from hybridvo.run.commands.export.colmap import write_colmap
 from hybridvo.run.commands.export.euroc import write_euroc
 from hybridvo.run.commands.export.transforms import write_transforms
-from hybridvo.run.commands.export.views import Points, View, points_of
+from hybridvo.run.commands.export.views import ColouredPoints, PosedImage, points_of
 
 CAMERA = Camera(fx=100.0, fy=110.0, cx=31.5, cy=23.5, height=48, width=64)
 TURNED = np.array([[0.0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]])
 """A camera at (1, 2, 3) that is turned by a quarter about y: it looks along the world's x."""
-TWO = Points(
+TWO = ColouredPoints(
     np.array([[1.5, -2, 3], [0, 0, 1]]), np.uint8([[255, 0, 9], [1, 2, 3]])
 )
 
@@ -88,9 +88,9 @@ def test_colmap_by_hand(tmp_path: Path) -> None:
     """World to camera: R^T = a quarter about -y, and -R^T (1, 2, 3) = (3, -2, -1)."""
     other = Camera(fx=50.0, fy=50.0, cx=15.5, cy=11.5, height=24, width=32)
     views = [
-        View("a.png", CAMERA, np.eye(4)),
-        View("b.png", CAMERA, TURNED),
-        View("c.png", other, np.eye(4)),
+        PosedImage("a.png", CAMERA, np.eye(4)),
+        PosedImage("b.png", CAMERA, TURNED),
+        PosedImage("c.png", other, np.eye(4)),
     ]
     write_colmap(tmp_path, views, TWO)
     model = read_colmap(tmp_path)
@@ -114,7 +114,10 @@ def test_colmap_by_hand(tmp_path: Path) -> None:
 
 def test_transforms_by_hand(tmp_path: Path) -> None:
     """Camera to world; the camera's x is right, y up, z backward."""
-    views = [View("a.png", CAMERA, np.eye(4)), View("b.png", CAMERA, TURNED)]
+    views = [
+        PosedImage("a.png", CAMERA, np.eye(4)),
+        PosedImage("b.png", CAMERA, TURNED),
+    ]
     write_transforms(tmp_path, views, TWO, "images", "masks")
     content = json.loads((tmp_path / "transforms.json").read_text())
     assert (content["fl_x"], content["fl_y"]) == (100, 110)
@@ -134,8 +137,8 @@ def test_transforms_by_hand(tmp_path: Path) -> None:
     assert cloud[-2:] == ["1.5 -2 3 255 0 9", "0 0 1 1 2 3"]
     # cameras that differ stand beside their frames
     other = Camera(fx=50.0, fy=50.0, cx=15.5, cy=11.5, height=24, width=32)
-    views.append(View("c.png", other, np.eye(4)))
-    write_transforms(tmp_path, views, Points.joined([]), "images", "masks")
+    views.append(PosedImage("c.png", other, np.eye(4)))
+    write_transforms(tmp_path, views, ColouredPoints.joined([]), "images", "masks")
     content = json.loads((tmp_path / "transforms.json").read_text())
     assert "fl_x" not in content and "ply_file_path" not in content
     assert [frame["fl_x"] for frame in content["frames"]] == [100, 100, 50]

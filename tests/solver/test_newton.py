@@ -11,17 +11,17 @@ from hybridvo.core.geometry import se3_exp
 from hybridvo.solver.newton import (
     FactorSum,
     Linearization,
-    State,
+    MotionState,
     newton,
 )
 from hybridvo.solver.newton_kernels import newton_step
 from hybridvo.solver.prior import Prior
 
 SEEDS = st.integers(0, 2**32 - 1)
-START = State(np.eye(4))
+START = MotionState(np.eye(4))
 
 
-def unknowns(state: State) -> np.ndarray:
+def unknowns(state: MotionState) -> np.ndarray:
     """Translation, and gain and offset less those of unchanged light."""
     light = state.gain_offset - START.gain_offset
     return np.concatenate([state.T_curr_prev[:3, 3], np.zeros(3), light])
@@ -35,7 +35,7 @@ class Quadratic:
         self.least = least
         self.costs: list[float] = []
 
-    def linearize(self, state: State) -> Linearization:
+    def linearize(self, state: MotionState) -> Linearization:
         away = unknowns(state) - self.least
         cost = float(0.5 * away @ self.H @ away)
         self.costs.append(cost)
@@ -97,7 +97,7 @@ class Robust:
         self.points = rng.normal(0.0, 0.5, (40, 3))
         self.points[:12] += rng.normal(0.0, 6.0, (12, 3))
 
-    def linearize(self, state: State) -> Linearization:
+    def linearize(self, state: MotionState) -> Linearization:
         r = self.points - state.T_curr_prev[:3, 3]
         robust = 9 / (9 + np.sum(r**2, axis=1))
         w = robust**2
@@ -114,7 +114,7 @@ class Robust:
 def test_the_cost_is_not_higher_at_the_end(seed: int) -> None:
     cost = Robust(seed)
     rng = np.random.default_rng(seed)
-    start = State(se3_exp(np.append(rng.normal(0, 4, 3), np.zeros(3))))
+    start = MotionState(se3_exp(np.append(rng.normal(0, 4, 3), np.zeros(3))))
     result = newton(cost, start, 20, 0.0)
     before = cost.linearize(start).cost
     assert cost.linearize(result.state).cost <= before + 1e-12
@@ -124,10 +124,10 @@ def test_the_cost_is_not_higher_at_the_end(seed: int) -> None:
 
 def scripted(costs: list[float]):
     """A factor whose call k has a cost and a gradient of its own, and the states it was asked."""
-    states: list[State] = []
+    states: list[MotionState] = []
 
     class Scripted:
-        def linearize(self, state: State) -> Linearization:
+        def linearize(self, state: MotionState) -> Linearization:
             cost = costs[len(states)]
             states.append(state)
             g = np.zeros(6)
@@ -186,7 +186,7 @@ def test_a_factor_of_the_motion_leaves_gain_and_offset_to_the_others() -> None:
     rng = np.random.default_rng(0)
     prior = Prior.around(np.eye(4), np.eye(6))
     images = drawn_quadratic(4)
-    at = State(se3_exp(0.1 * rng.normal(size=6)))
+    at = MotionState(se3_exp(0.1 * rng.normal(size=6)))
     total = FactorSum([images, prior]).linearize(at)
     alone = images.linearize(at)
     by_prior = prior.linearize(at)

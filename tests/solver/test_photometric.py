@@ -16,7 +16,7 @@ from hybridvo.flow.providers import dis_flow
 from hybridvo.solver.image_factor import ImageFactor
 from hybridvo.solver.image_kernels import read_cubic
 from hybridvo.solver.images import choose_pixels
-from hybridvo.solver.newton import State
+from hybridvo.solver.newton import MotionState
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.rows import ImageRow
 from hybridvo_lab.synthetic.render import SyntheticSequence
@@ -65,7 +65,7 @@ def test_cubic_reading_is_exact_on_parabolas():
 def rows_at(factor, T):
     """Residuals and derivatives at a motion, for images of the same brightness."""
     noisy = factor.under(factor.first(T))
-    noisy.linearize(State(T))
+    noisy.linearize(MotionState(T))
     return noisy.rows
 
 

@@ -10,7 +10,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.options import RefineOptions
-from hybridvo.solver.newton import State
+from hybridvo.solver.newton import MotionState
 from hybridvo.solver.planes import PlaneFactor, PlanesAt, depth_quantum
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
@@ -32,7 +32,7 @@ def gradient(at: PlanesAt) -> np.ndarray:
 def cost(factor: PlaneFactor, at: PlanesAt, T: np.ndarray) -> float:
     """The cost at a motion, under the noise at another one."""
     noisy = factor.under(at)._replace(information_scale=1.0)
-    return noisy.linearize(State(T)).cost
+    return noisy.linearize(MotionState(T)).cost
 
 
 def noisy(pair, polynomial, seed: int):

@@ -13,7 +13,7 @@ from hybridvo.core.geometry import ego_flow, pixel_grid, se3_exp
 from hybridvo.core.torch_geometry import left_update, pp, reproject, se3
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.solver import kernels
-from hybridvo.solver.newton import State
+from hybridvo.solver.newton import MotionState
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.refine_flow import FlowFactor
 from hybridvo.solver.torch.factors import (
@@ -160,7 +160,7 @@ def numba_step(
     weighting = kernels.residual_noise(*noise, 3.0)
     scores = kernels.ScoreProducts(np.zeros(21), np.zeros(21))
     image = PixelGrid(pair, None if weights is None else weights[0].float().numpy())
-    at = FlowFactor(image, weighting, 24, scores).linearize(State(T))
+    at = FlowFactor(image, weighting, 24, scores).linearize(MotionState(T))
     return np.linalg.solve(at.H, at.g)
 
 

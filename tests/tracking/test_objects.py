@@ -16,7 +16,7 @@ from hybridvo.core.results import Step
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.tracking.object_motions import (
     Earlier,
-    View,
+    GridView,
 )
 from hybridvo.tracking.objects import MAX_OBJECTS, Things, after_step
 from hybridvo_lab.synthetic.scenes import make_scene
@@ -74,7 +74,7 @@ def follow(frames: list[hvo.Frame]) -> list[tuple[hvo.MovingObject, ...]]:
     for k in range(1, len(frames)):
         before = Earlier(frames[k - 1], np.eye(4))
         far = Earlier(frames[0], np.eye(4)) if k > 1 else None
-        found = after_step(things, View(frames[k], before, far), 1, Options())
+        found = after_step(things, GridView(frames[k], before, far), 1, Options())
         things = found.things
         seen.append(found.seen)
     return seen
@@ -214,7 +214,7 @@ def test_a_resumed_tracker_goes_on_with_the_same_objects() -> None:
 def test_all_lengths_of_objects_grow_with_the_scale() -> None:
     frames = [view(Box(30 + 3 * k), index=k) for k in range(3)]
     things = after_step(
-        Things(), View(frames[1], Earlier(frames[0], np.eye(4))), 1, Options()
+        Things(), GridView(frames[1], Earlier(frames[0], np.eye(4))), 1, Options()
     ).things
     larger = things.rescaled(2.0)
     (one,), (two,) = things.known, larger.known

@@ -33,7 +33,7 @@ from scipy.stats import spearmanr
 from bench.semi_real import StaticPart, static_part
 from hybridvo import PWVO, PairBatch, refine
 from hybridvo.core.geometry import pose_matrix
-from hybridvo.network.pair_maps import Look, look_at_pair
+from hybridvo.network.pair_maps import PairLook, look_at_pair
 from hybridvo.network.selection import seed_weights
 from hybridvo.solver.torch.patches import PatchPoses, patch_poses
 from hybridvo.solver.torch.tools import PoseSeed
@@ -187,7 +187,9 @@ def rows_of(source: Source) -> list[dict[str, Any]]:
 
 
 @torch.no_grad()
-def errors_of(known: KnownPair, static: StaticPart, look: Look) -> dict[str, Any]:
+def errors_of(
+    known: KnownPair, static: StaticPart, look: PairLook
+) -> dict[str, Any]:
     """Errors of every start and of what it is refined to, px of the ego flow, static pixels."""
     pair = looked(known, look)
 
@@ -218,7 +220,7 @@ def errors_of(known: KnownPair, static: StaticPart, look: Look) -> dict[str, Any
     }
 
 
-def looked(known: KnownPair, look: Look) -> Looked:
+def looked(known: KnownPair, look: PairLook) -> Looked:
     """What PWVO states of a pair by its look."""
     batch = PairBatch.from_pairs([known.pair])
     hypothesis = torch.from_numpy(pose_matrix(look.hypothesis.pose))[None]

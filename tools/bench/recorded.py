@@ -23,7 +23,7 @@ from hybridvo import Frame, FramePair, Odometry, open_sequence
 from hybridvo.flow.providers import dis_flow
 from hybridvo_lab import baselines
 from hybridvo_lab.baselines.correspondences import depth_in_range
-from hybridvo_lab.baselines.images import Images, align_opencv
+from hybridvo_lab.baselines.images import PairImages, align_opencv
 
 RECORDINGS = (
     "tripod/corridor",
@@ -136,7 +136,9 @@ def figures(runs: list[Run]) -> dict[str, Any]:
 
 def by_images(prev: Frame, curr: Frame) -> Work:
     """OpenCV's RGB-D odometry of a pair, ready to be called."""
-    images = Images([prev.rgb, curr.rgb], [known_depth(prev), known_depth(curr)])
+    images = PairImages(
+        [prev.rgb, curr.rgb], [known_depth(prev), known_depth(curr)]
+    )
     farthest = float(np.nanmax(images.depth[0]))
     return partial(align_opencv, images, prev.camera, farthest + BEYOND_M)
 

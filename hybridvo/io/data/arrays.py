@@ -20,7 +20,7 @@ from hybridvo.core.types import Camera
 from hybridvo.io.data.camera_file import parse_camera
 from hybridvo.io.data.lists import abbreviated, assumed_rate
 from hybridvo.io.data.streams import (
-    Images,
+    FrameImages,
     Lens,
     StreamSequence,
     straightened,
@@ -138,7 +138,7 @@ class ArraySequence(StreamSequence):
         checked[known] = as_rigid(poses[known], where, FILE_TOLERANCE, many=True)
         self.poses = checked
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         rgb = np.array(self._rgb[index])
         stored = self._depth[index]
         depth = stored.astype(np.float32) / np.float32(self._units)

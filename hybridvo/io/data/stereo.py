@@ -14,7 +14,7 @@ from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
 from hybridvo.io.calibration import DISPARITY_STD_PX
 from hybridvo.io.data.sequence import UndistortionMaps, undistort
-from hybridvo.io.data.streams import Images, Lens
+from hybridvo.io.data.streams import FrameImages, Lens
 
 # px that are searched: at KITTI's focal length and baseline all beyond 3 m, at
 # EuRoC's beyond 0.4 m
@@ -113,7 +113,9 @@ def T_right_left_of(
     return invert(T_body_right) @ T_body_left
 
 
-def stereo_images(left: np.ndarray, right: np.ndarray, rig: Rectified) -> Images:
+def stereo_images(
+    left: np.ndarray, right: np.ndarray, rig: Rectified
+) -> FrameImages:
     """Return the rectified left image with its depth, and how far that errs.
 
     Args:
@@ -129,7 +131,7 @@ def stereo_images(left: np.ndarray, right: np.ndarray, rig: Rectified) -> Images
     disparity = match(left, right)
     disparity_at_1m = rig.camera.fx * rig.baseline
     depth, variance = depth_from_disparity(disparity, disparity_at_1m)
-    return Images(left, depth, variance, mask)
+    return FrameImages(left, depth, variance, mask)
 
 
 def matcher_of(width: int) -> cv2.StereoSGBM:

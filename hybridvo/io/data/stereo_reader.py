@@ -30,7 +30,7 @@ from hybridvo.io.data.stereo import (
     stereo_images,
 )
 from hybridvo.io.data.streams import (
-    Images,
+    FrameImages,
     Lens,
     StreamSequence,
     check_lens,
@@ -59,7 +59,7 @@ class StereoSequence(StreamSequence):
         """Return what decides how the files are read beside themselves, JSON-ready."""
         return super().opened_with() | {"baseline": self._rig.baseline}
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         left_path, right_path = self._pairs[index]
         left = read_rgb(left_path, self._size_taken)
         right = read_rgb(right_path, self._size_taken)

@@ -38,7 +38,7 @@ BROWN_MODELS = (
 """What ROS, Kalibr and RealSense call OpenCV's own model."""
 
 
-class Images(NamedTuple):
+class FrameImages(NamedTuple):
     """What a frame is made of, all of one size; None where there is none."""
 
     rgb: np.ndarray | None  # (H, W, 3) or (H, W) uint8
@@ -49,12 +49,12 @@ class Images(NamedTuple):
 
 def straightened(
     maps: UndistortionMaps | None, rgb: np.ndarray, depth: np.ndarray | None
-) -> Images:
+) -> FrameImages:
     """Return images without the distortion of a lens; as they are where it has none."""
     if maps is None:
-        return Images(rgb, depth)
+        return FrameImages(rgb, depth)
     straight, straight_depth, mask = undistort(maps, rgb, depth, None)
-    return Images(straight, straight_depth, mask=mask)
+    return FrameImages(straight, straight_depth, mask=mask)
 
 
 class Lens(NamedTuple):
@@ -180,7 +180,7 @@ class StreamSequence(Sequence):
         """Fill in stamps, poses and camera; every reader has its own."""
         raise NotImplementedError
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         """Make the images of one frame; every reader has its own."""
         raise NotImplementedError
 

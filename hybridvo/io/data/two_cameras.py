@@ -9,7 +9,7 @@ from hybridvo.core.types import Camera
 from hybridvo.io.data.registration import register_depth
 from hybridvo.io.data.resize import resize_camera
 from hybridvo.io.data.sequence import UndistortionMaps, undistort
-from hybridvo.io.data.streams import Images, Lens
+from hybridvo.io.data.streams import FrameImages, Lens
 
 
 class TwoCameras:
@@ -49,7 +49,9 @@ class TwoCameras:
         is_one = np.allclose(T_colour_depth, np.eye(4))
         self._is_registered = is_one and depth.camera == self.camera
 
-    def images(self, rgb: np.ndarray | None, depth: np.ndarray | None) -> Images:
+    def images(
+        self, rgb: np.ndarray | None, depth: np.ndarray | None
+    ) -> FrameImages:
         """Return the images of a frame.
 
         Args:
@@ -68,7 +70,7 @@ class TwoCameras:
             _, depth, _ = undistort(self._depth_maps, None, depth, None)
         if depth is not None and not self._is_registered:
             depth = register_depth(depth, self._depth_camera, self._T, self.camera)
-        return Images(rgb, depth, mask=mask)
+        return FrameImages(rgb, depth, mask=mask)
 
     def _resized(self, rgb: np.ndarray) -> np.ndarray:
         if rgb.shape[:2] == self.camera.shape:

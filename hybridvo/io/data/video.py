@@ -26,7 +26,7 @@ from hybridvo.io.data.image_io import image_size, read_depth, read_mask_png
 from hybridvo.io.data.resize import resize_camera
 from hybridvo.io.data.sequence import in_metres
 from hybridvo.io.data.streams import (
-    Images,
+    FrameImages,
     Lens,
     StreamSequence,
     straightened,
@@ -260,7 +260,7 @@ class VideoSequence(StreamSequence):
                 self.timestamps, *truth, path, self.warnings
             )
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         rgb = self._video.frame(self._frame_at[index])
         depth = None
         if self._needs_depth:
@@ -405,7 +405,7 @@ class StrayScannerSequence(VideoSequence):
             )
         self.poses = poses
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         camera = self.camera(0)
         rgb = self._video.frame(self._frame_at[index])
         size = (camera.width, camera.height)
@@ -418,4 +418,4 @@ class StrayScannerSequence(VideoSequence):
             is_confident = read_mask_png(confidence, self._depth_size)
             depth = np.where(is_confident, depth, np.float32(0))
         large = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        return Images(small, large)
+        return FrameImages(small, large)

@@ -10,7 +10,7 @@ import numpy as np
 from hybridvo.core.errors import InputError
 from hybridvo.core.files import atomic_write
 from hybridvo.io.viewer.layout import blueprint
-from hybridvo.io.viewer.scene import TRUTH, Scene, Seen
+from hybridvo.io.viewer.scene import TRUTH, Seen, ViewerScene
 
 MAX_IMAGES = 300
 """Images of a kind in a recording, which then has about 30 MB."""
@@ -35,7 +35,7 @@ def check_recording(path: str | Path) -> None:
         ) from None
 
 
-class Recording:
+class RecordingWriter:
     """Writes a recording frame by frame, with the streams that the viewer shows.
 
     Args:
@@ -65,7 +65,7 @@ class Recording:
         self._count = 0
         self._stream = rerun.RecordingStream(f"hybridvo {name}")
         self._stream.save(self.path, default_blueprint=blueprint())
-        self._scene = Scene(self._stream)
+        self._scene = ViewerScene(self._stream)
         if truth is not None:
             self._scene.add_line(TRUTH, truth)
 

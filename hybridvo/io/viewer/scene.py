@@ -115,7 +115,7 @@ class Sink(Protocol):
         """Finish."""
 
 
-class Scene:
+class ViewerScene:
     """Logs steps to a Rerun stream.
 
     Args:

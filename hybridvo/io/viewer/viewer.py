@@ -20,7 +20,7 @@ import numpy as np
 from hybridvo.io.viewer.address import CONNECT, Address, parse_address
 from hybridvo.io.viewer.layout import blueprint
 from hybridvo.io.viewer.program import REMEDY, NoViewer, Program, listens
-from hybridvo.io.viewer.scene import TRUTH, Scene, Seen
+from hybridvo.io.viewer.scene import TRUTH, Seen, ViewerScene
 
 # s after which a viewer that takes nothing is lost; the tracker does not wait
 VIEWER_SILENCE_S = 5.0
@@ -103,7 +103,7 @@ class Viewer:
         """Connect, and show steps until there are no more or the viewer is lost."""
         try:
             stream = self._open_stream()
-            scene = Scene(stream)
+            scene = ViewerScene(stream)
             if self._truth is not None:
                 scene.add_line(TRUTH, self._truth)
         except NoViewer as error:
@@ -120,7 +120,7 @@ class Viewer:
             words = self._program.last_words() if self._program else ""
             self._lose(f"is lost: {words or one_line(error)}")
 
-    def _show(self, stream: Any, scene: Scene) -> None:
+    def _show(self, stream: Any, scene: ViewerScene) -> None:
         """Show steps until there are no more; raises where the viewer takes none."""
         while not self._is_lost.is_set():
             seen = self._waiting.get()

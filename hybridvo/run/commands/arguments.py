@@ -16,7 +16,7 @@ from hybridvo import __version__
 from hybridvo.core.errors import did_you_mean, printable
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.run.commands import dispatch
-from hybridvo.run.commands.dispatch import Outcome, calling, from_laboratory
+from hybridvo.run.commands.dispatch import CommandResult, calling, from_laboratory
 
 # s that the doctor looks at a live camera: 150 frames, two turns to and fro
 DOCTOR_SECONDS = 5.0
@@ -339,7 +339,7 @@ class Command(NamedTuple):
 
     name: str
     about: str
-    call: Callable[[Namespace], Outcome]
+    call: Callable[[Namespace], CommandResult]
     arguments: tuple[Argument | Either, ...]
     # those of shared arguments, where the command has its own
     defaults: dict[str, Any]
@@ -348,7 +348,7 @@ class Command(NamedTuple):
 def command(
     name: str,
     about: str,
-    call: Callable[[Namespace], Outcome],
+    call: Callable[[Namespace], CommandResult],
     *arguments: Argument | Either,
     **defaults: Any,
 ) -> Command:

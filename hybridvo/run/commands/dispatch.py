@@ -46,14 +46,14 @@ SCENE_FOLDERS = (
 """Folders of MPI Sintel. A scene may be named in any of them, even if it is not there."""
 
 
-class Outcome(NamedTuple):
+class CommandResult(NamedTuple):
     """What a command returns."""
 
     content: dict[str, Any]  # JSON-ready
     exit_code: int = 0
 
 
-def calling(place: str) -> Callable[[Namespace], Outcome]:
+def calling(place: str) -> Callable[[Namespace], CommandResult]:
     """Return a command that calls a function, which returns a report or the file it wrote.
 
     Args:
@@ -62,19 +62,19 @@ def calling(place: str) -> Callable[[Namespace], Outcome]:
     return partial(_call_place, place)
 
 
-def from_laboratory(name: str) -> Callable[[Namespace], Outcome]:
+def from_laboratory(name: str) -> Callable[[Namespace], CommandResult]:
     """Return a command that calls a function of hybridvo-lab, likewise."""
     return partial(_call_laboratory, name)
 
 
-def _call_place(place: str, args: Namespace) -> Outcome:
+def _call_place(place: str, args: Namespace) -> CommandResult:
     """Call ``MODULE:FUNCTION`` with the arguments that it takes."""
     given = prepared(args)
     module, _, name = place.partition(":")
     return _outcome_of(getattr(import_module(module), name), given)
 
 
-def _call_laboratory(name: str, args: Namespace) -> Outcome:
+def _call_laboratory(name: str, args: Namespace) -> CommandResult:
     """Call a function of hybridvo-lab with the arguments that it takes."""
     laboratory.check_there(laboratory.COMMANDS, name, _as_typed(name))
     given = prepared(args)
@@ -94,12 +94,14 @@ def _as_typed(name: str) -> str:
     return f"'hybridvo {name.replace('-', ' ')}'"
 
 
-def _outcome_of(function: Callable[..., Any], given: Mapping[str, Any]) -> Outcome:
+def _outcome_of(
+    function: Callable[..., Any], given: Mapping[str, Any]
+) -> CommandResult:
     """The outcome of a function that returns a report or the file it wrote."""
     result = call(function, given)
     if isinstance(result, Path):
         result = {"files": [str(result)]}
-    return Outcome(result)
+    return CommandResult(result)
 
 
 def taken_by(
@@ -118,7 +120,7 @@ def call(function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
 # -- commands that are more than a call --------------------------------------------------
 
 
-def run(args: Namespace) -> Outcome:
+def run(args: Namespace) -> CommandResult:
     """``hybridvo run``: track a sequence, and name the command that shows its least sure step."""
     given = prepared(args)
     from hybridvo.run.commands.run import run
@@ -127,10 +129,10 @@ def run(args: Namespace) -> Outcome:
     worst = summary.get("least_sure")
     if worst is not None:
         summary["next"] = command_that_shows(args, worst["frame"])
-    return Outcome(summary, exit_code)
+    return CommandResult(summary, exit_code)
 
 
-def live(args: Namespace) -> Outcome:
+def live(args: Namespace) -> CommandResult:
     """``hybridvo live``: track a camera."""
     check_camera(args.camera, args.preset)
     given = prepared(args)
@@ -140,10 +142,10 @@ def live(args: Namespace) -> Outcome:
     camera = call(choose_camera, given | {"name": args.camera, "depth": source})
     from hybridvo.run.commands.live import live
 
-    return Outcome(*call(live, given | {"camera": camera}))
+    return CommandResult(*call(live, given | {"camera": camera}))
 
 
-def evaluate(args: Namespace) -> Outcome:
+def evaluate(args: Namespace) -> CommandResult:
     """``hybridvo evaluate``: compute the errors of a trajectory."""
     given = prepared(args)
     from hybridvo.core.errors import InputError
@@ -156,10 +158,10 @@ def evaluate(args: Namespace) -> Outcome:
         reasons = list(dict.fromkeys(report["reasons"].values()))
     if report["matched"] == 0:
         raise InputError(f"nothing could be compared: {'; '.join(reasons)}.")
-    return Outcome(report)
+    return CommandResult(report)
 
 
-def doctor(args: Namespace) -> Outcome:
+def doctor(args: Namespace) -> CommandResult:
     """``hybridvo doctor``: check what is installed, a sequence, or a camera."""
     from hybridvo.core.errors import InputError
 
@@ -176,7 +178,7 @@ def doctor(args: Namespace) -> Outcome:
     if args.speed:
         from hybridvo.run.commands.diagnosis.speed import speed
 
-        return Outcome(call(speed, given))
+        return CommandResult(call(speed, given))
     from hybridvo.run.commands.doctor import diagnose, diagnose_camera, installation
 
     if is_live:
@@ -184,15 +186,15 @@ def doctor(args: Namespace) -> Outcome:
     elif args.sequence is not None:
         report = call(diagnose, given)
     else:
-        return Outcome(installation())
-    return Outcome(report, 0 if report["ok"] else 1)
+        return CommandResult(installation())
+    return CommandResult(report, 0 if report["ok"] else 1)
 
 
-def train(args: Namespace) -> Outcome:
+def train(args: Namespace) -> CommandResult:
     """``hybridvo train pwvo`` and ``train paper``: train a network."""
     check_config(args.config)
     given = prepared(args)
-    return Outcome(call(_command_of_laboratory("train"), given))
+    return CommandResult(call(_command_of_laboratory("train"), given))
 
 
 # -- what commands share -----------------------------------------------------------------

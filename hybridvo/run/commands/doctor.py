@@ -37,7 +37,7 @@ from hybridvo.run.calibration import (
     MIN_VALID_DEPTH,
 )
 from hybridvo.run.commands.arguments import DOCTOR_SECONDS
-from hybridvo.run.commands.diagnosis.answer import Answer
+from hybridvo.run.commands.diagnosis.answer import Diagnosis
 from hybridvo.run.commands.diagnosis.capture import Captured, capture
 from hybridvo.run.commands.diagnosis.clocks import one_clock
 from hybridvo.run.commands.diagnosis.depth_lag import depth_lag
@@ -182,7 +182,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
     if clocks.differs and registered.differs:
         remedy = "put the clocks right first, and look again"
         found = registered.message.partition(":")[0]
-        registered = Answer(None, f"{found}: {remedy}")
+        registered = Diagnosis(None, f"{found}: {remedy}")
     answers["depth beside images"] = registered
     answers["lag of depth"] = depth_lag(sequence, CLOCK_PAIRS * pairs)
     answers["rolling shutter"] = rolling_shutter(sequence, CLOCK_PAIRS * pairs)
@@ -319,21 +319,21 @@ def _percent(fraction: float) -> str:
     return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
-def _units(table: pd.DataFrame) -> Answer:
+def _units(table: pd.DataFrame) -> Diagnosis:
     """Answer whether depth is in metres."""
     depths = table["depth"].dropna().astype(float)
     scales = table["length"].dropna().astype(float)
     if depths.empty:
-        return Answer(None, "no frame has valid depth")
+        return Diagnosis(None, "no frame has valid depth")
     text = f"median depth {depths.median():.3g} m"
     fix = depth_unit_fix(float(depths.median()))
     if len(scales) < MIN_SCALE_PAIRS:
         if fix:
-            return Answer(
+            return Diagnosis(
                 True, f"{text}, which cannot be metres; probable remedy: {fix}"
             )
         # Depths and translations times s project to the same pixels: only poses show the scale.
-        return Answer(
+        return Diagnosis(
             None,
             f"{text}, as a camera sees, but only poses can show whether it is exact; "
             f"true motions (poses.txt) beyond 1 cm: {len(scales)} pairs, "
@@ -342,21 +342,21 @@ def _units(table: pd.DataFrame) -> Answer:
     low, scale, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
     text += f"; motions are {scale:.4g} times as long as the poses on file state"
     if abs(scale - 1) <= MAX_SCALE_ERROR or low < 1 < high:
-        return Answer(False, text)
+        return Diagnosis(False, text)
     if not fix:
         fix = (
             f"divide by {scale:.4g}"
             if scale > 1
             else f"multiply by {1 / scale:.4g}"
         )
-    return Answer(True, f"{text}: depth: {fix}")
+    return Diagnosis(True, f"{text}: depth: {fix}")
 
 
-def _depth_steps(table: pd.DataFrame) -> Answer:
+def _depth_steps(table: pd.DataFrame) -> Diagnosis:
     """Answer whether depth keeps its scale from frame to frame."""
     ratios = table["depth_ratio"].dropna().astype(float)
     if ratios.empty:
-        return Answer(None, "no pair has a motion and depth in both frames")
+        return Diagnosis(None, "no pair has a motion and depth in both frames")
     log_ratios = np.log(ratios.clip(lower=1e-30)).abs()
     steps = int((log_ratios > DOUBTFUL_SPREAD).sum())
     k = log_ratios.idxmax()
@@ -365,91 +365,93 @@ def _depth_steps(table: pd.DataFrame) -> Answer:
         f"to the next (times {ratios[k]:.3g})"
     )
     if not steps:
-        return Answer(False, text)
+        return Diagnosis(False, text)
     cause = "files of several units, or a scale of its own in every frame"
-    return Answer(True, f"{text}: {cause}")
+    return Diagnosis(True, f"{text}: {cause}")
 
 
-def _images_against_flow(table: pd.DataFrame) -> Answer:
+def _images_against_flow(table: pd.DataFrame) -> Diagnosis:
     """Answer whether the flow on file moves the images onto each other."""
     known = table["contradiction"].dropna()
     if known.empty:
-        return Answer(None, "no pair has images and a flow on file")
+        return Diagnosis(None, "no pair has images and a flow on file")
     contradicted = known[known != ""]
     text = (
         f"the flow contradicts the images in {len(contradicted)} of "
         f"{len(known)} pairs"
     )
     if len(contradicted) <= MAX_CONTRADICTED * len(known):
-        return Answer(False, text)
+        return Diagnosis(False, text)
     frame = contradicted.index[0]
-    return Answer(True, f"{text}; frame {frame}: {contradicted.iloc[0]}")
+    return Diagnosis(True, f"{text}; frame {frame}: {contradicted.iloc[0]}")
 
 
-def _valid_depth(table: pd.DataFrame) -> Answer:
+def _valid_depth(table: pd.DataFrame) -> Diagnosis:
     """Answer whether there is enough depth in the frames."""
     fractions = table["valid"].dropna().astype(float)
     if fractions.empty:
-        return Answer(None, "no frame has a depth map")
+        return Diagnosis(None, "no frame has a depth map")
     empty = fractions[fractions < EMPTY_DEPTH]
     text = f"{_percent(fractions.median())} of the pixels in the median frame"
     if fractions.median() < MIN_VALID_DEPTH:
         cause = "distance, sunlight, glass, or a projection that fills one pixel in several"
-        return Answer(
+        return Diagnosis(
             True,
             f"{text}: too few to be sure of a motion; look for {cause}",
         )
     if len(empty):
         count = f"{len(empty)} of {len(fractions)} (frame {empty.index[0]})"
         remedy = "see that the sensor delivers; the next motion spans such a frame"
-        return Answer(True, f"{text}, none in {count}: {remedy}")
-    return Answer(False, text)
+        return Diagnosis(True, f"{text}, none in {count}: {remedy}")
+    return Diagnosis(False, text)
 
 
-def _texture_and_focus(table: pd.DataFrame) -> Answer:
+def _texture_and_focus(table: pd.DataFrame) -> Diagnosis:
     """Answer whether the images have texture, and are sharp."""
     known = table[["texture", "focus"]].dropna().astype(float)
     if known.empty:
-        return Answer(None, "no frame has an image")
+        return Diagnosis(None, "no frame has an image")
     texture, focus = known.median()
     text = (
         f"{_percent(texture)} of the pixels have a gradient; sharpness {focus:.2g}"
     )
     if texture < MIN_TEXTURE:
         remedy = "more light, a longer exposure, another view"
-        return Answer(True, f"{text}: hardly any texture; {remedy}")
+        return Diagnosis(True, f"{text}: hardly any texture; {remedy}")
     if focus < MIN_FOCUS:
         remedy = "check focus, exposure, compression, resizing"
-        return Answer(True, f"{text}: blurred or enlarged; {remedy}")
+        return Diagnosis(True, f"{text}: blurred or enlarged; {remedy}")
     blurred = known[known["focus"] < MIN_FOCUS]
     if len(blurred):
         text += (
             f"; {len(blurred)} of {len(known)} are blurred, "
             f"as frame {blurred.index[0]}: a shorter exposure"
         )
-    return Answer(False, text)
+    return Diagnosis(False, text)
 
 
-def _intrinsics(camera: Camera | None) -> Answer:
+def _intrinsics(camera: Camera | None) -> Diagnosis:
     """Answer whether the intrinsics are those of the images."""
     if camera is None:
-        return Answer(None, "no frame can be read")
+        return Diagnosis(None, "no frame can be read")
     if question := resolution_question(camera):
-        return Answer(None, question)
+        return Diagnosis(None, question)
     place = f"({camera.cx:.4g}, {camera.cy:.4g})"
     size = f"{camera.width}x{camera.height} pixels"
-    return Answer(False, f"the principal point {place} is that of images of {size}")
+    return Diagnosis(
+        False, f"the principal point {place} is that of images of {size}"
+    )
 
 
-def _focal_length(table: pd.DataFrame) -> Answer:
+def _focal_length(table: pd.DataFrame) -> Diagnosis:
     """Answer whether the focal length fits what turns of the camera show."""
     shown = FocalDrift()
     for bends in table["bends"].dropna():
         shown = shown.with_bend(bends.focal)
     if shown.is_off:
-        return Answer(True, shown.message)
+        return Diagnosis(True, shown.message)
     if not shown.is_known:
-        return Answer(
+        return Diagnosis(
             None,
             f"{shown.steps} motions turn the view; {MIN_CAMERA_STEPS} are needed: turn the "
             f"camera to and fro, or pass more --pairs",
@@ -460,10 +462,10 @@ def _focal_length(table: pd.DataFrame) -> Answer:
     )
     # farther away than distortion and a rolling shutter explain, but not surely
     is_doubtful = abs(shown.error) > MAX_FOCAL_ERROR
-    return Answer(None if is_doubtful else False, text)
+    return Diagnosis(None if is_doubtful else False, text)
 
 
-def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:
+def _registration(table: pd.DataFrame, sequence: Sequence) -> Diagnosis:
     """Answer whether the edges of depth lie on those of the images, shifted or enlarged."""
     answer = registration(table["edges"].dropna().to_list())
     if answer.differs is not None:
@@ -471,7 +473,7 @@ def _registration(table: pd.DataFrame, sequence: Sequence) -> Answer:
     return zoomed_registration(sequence) or answer
 
 
-QUESTIONS: dict[str, Callable[[pd.DataFrame], Answer]] = {
+QUESTIONS: dict[str, Callable[[pd.DataFrame], Diagnosis]] = {
     "depth units": _units,
     "depth from frame to frame": _depth_steps,
     "valid depth": _valid_depth,

@@ -37,7 +37,7 @@ from hybridvo.io.live import RATE_STEPS, LiveStep, LiveStream, stream
 from hybridvo.io.live_rate import AutoRate
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.io.viewer.address import parse_address
-from hybridvo.io.viewer.recording import Recording, check_recording
+from hybridvo.io.viewer.recording import RecordingWriter, check_recording
 from hybridvo.io.viewer.scene import Sink
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
@@ -154,7 +154,7 @@ def live(
         shown: list[Sink] = [viewer] if viewer else []
         if rrd is not None:
             count = max_frames or int(LIVE_RATE_HZ * (seconds or LIVE_RECORDING_S))
-            shown.append(Recording(rrd, camera.name, count))
+            shown.append(RecordingWriter(rrd, camera.name, count))
         sinks += [stack.enter_context(_Rerun(shown, trackers)), screen]
         _pump(steps, sinks)
         summary = _summarise(steps, stop, folder, screen.messages, rrd)

@@ -44,7 +44,7 @@ from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.data.truth import true_trajectory
 from hybridvo.io.onnx.flow import FlowNetwork
 from hybridvo.io.viewer.address import parse_address
-from hybridvo.io.viewer.recording import Recording, check_recording
+from hybridvo.io.viewer.recording import RecordingWriter, check_recording
 from hybridvo.io.viewer.scene import Seen, Sink, position_covariance
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
@@ -241,7 +241,9 @@ def run(
                 truth = _path_from_origin(sequence, frames)
             if recording_path is not None:
                 count = len(frames)
-                recording = Recording(recording_path, sequence.name, count, truth)
+                recording = RecordingWriter(
+                    recording_path, sequence.name, count, truth
+                )
                 stack.callback(recording.close)
                 job.sinks.append(recording)
             if view is not None:

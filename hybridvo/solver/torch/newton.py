@@ -62,7 +62,7 @@ class Rested(NamedTuple, Generic[S]):
     solved: bool  # whether every step existed
 
 
-class Step(NamedTuple):
+class NewtonStep(NamedTuple):
     """A step of every sample."""
 
     delta: torch.Tensor  # (B, n)
@@ -117,19 +117,21 @@ def newton(
     return Rested(state, converged, iterations, bool(solved.all()))
 
 
-def newton_step(at: Equations) -> Step:
+def newton_step(at: Equations) -> NewtonStep:
     """Return Newton's step where it leads downhill, elsewhere that of Gauss-Newton.
 
     A robust kernel may bend so far that the full derivative is not definite.
     """
     plain, solved = solve_small(at.H, at.g, DAMPING)
     if at.curvature is None:
-        return Step(plain, torch.zeros_like(solved), solved)
+        return NewtonStep(plain, torch.zeros_like(solved), solved)
     newton, exists = solve_small(at.H - at.curvature, at.g)
     decrease = (newton * at.g).sum(dim=1)
     is_short = energy(newton, at.H) <= at.max_step_ratio * decrease
     is_newton = exists & (decrease > 0) & is_short
-    return Step(torch.where(is_newton[:, None], newton, plain), is_newton, solved)
+    return NewtonStep(
+        torch.where(is_newton[:, None], newton, plain), is_newton, solved
+    )
 
 
 def energy(step: torch.Tensor, H: torch.Tensor) -> torch.Tensor:

@@ -75,7 +75,7 @@ class Starts(NamedTuple):
     covariance: torch.Tensor | None
 
 
-class Region(NamedTuple):
+class SearchRegion(NamedTuple):
     """Where the motions of a batch are sought: around their seeds, as their covariances state."""
 
     seed: pp.LieTensor  # (B, 7)
@@ -114,7 +114,7 @@ class BatchFit(NamedTuple):
     # (B, 7) the solution of the equations; T is the seed where that lies outside of its region
     solution: pp.LieTensor
     is_seed: torch.Tensor  # (B,) whether T is the seed for that reason
-    region: Region
+    region: SearchRegion
     noise: torch.Tensor  # (B, 2) px, log depth
     followers: torch.Tensor  # (B,) fraction of the weight that follows the motion
     # (B,) fraction that follows another motion instead, fitted from the identity
@@ -205,7 +205,7 @@ def _prefers_some(pixels: Pixels) -> torch.Tensor:
 
 def _best_start(
     pixels: Pixels, starts: Starts, last_scale: torch.Tensor
-) -> tuple[pp.LieTensor, torch.Tensor, Region]:
+) -> tuple[pp.LieTensor, torch.Tensor, SearchRegion]:
     """Anneal every start, and return the motion of least cost of each sample.
 
     Returns:
@@ -218,7 +218,7 @@ def _best_start(
     largest = _largest_scales(repeated, first, starts)
     scales = last_scale.repeat_interleave(count)
     information = _seed_information(starts)
-    region = Region(first, information.flatten(0, 1))
+    region = SearchRegion(first, information.flatten(0, 1))
     T = _anneal(repeated, first, largest, scales, region)
     cost = factors.linearize(repeated, T, exact_depth_model(scales)).cost
     cost = torch.nan_to_num(cost.reshape(batch, count), nan=torch.inf)
@@ -229,7 +229,7 @@ def _best_start(
     return (
         pp.SE3(motions[index, best]),
         largest.reshape(batch, count)[index, best],
-        Region(seed, information[index, best]),
+        SearchRegion(seed, information[index, best]),
     )
 
 
@@ -274,7 +274,7 @@ def _anneal(
     T: pp.LieTensor,
     largest_scale: torch.Tensor,
     last_scale: torch.Tensor,
-    region: Region | None = None,
+    region: SearchRegion | None = None,
 ) -> pp.LieTensor:
     """Make one Gauss-Newton step at each scale of the robust kernel, inside of a region.
 

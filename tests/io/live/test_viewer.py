@@ -15,8 +15,8 @@ import hybridvo as hvo
 from hybridvo.core.geometry import se3_exp
 from hybridvo.io.live import LiveStream, stream
 from hybridvo.io.viewer import address, program, scene, viewer
-from hybridvo.io.viewer.recording import Recording
-from hybridvo.io.viewer.scene import Scene, Seen
+from hybridvo.io.viewer.recording import RecordingWriter
+from hybridvo.io.viewer.scene import Seen, ViewerScene
 from tests.io.live.scripted import (
     CAMERA,
     QUICK,
@@ -98,7 +98,7 @@ def wire() -> Wire:
 
 
 def test_everything_about_a_step_is_shown(wire: Wire) -> None:
-    shown = Scene(wire)
+    shown = ViewerScene(wire)
     for index in range(3):
         shown.add(seen(index))
     paths = {name for name, _ in wire.logged}
@@ -118,7 +118,7 @@ def test_everything_about_a_step_is_shown(wire: Wire) -> None:
 def test_a_failed_motion_turns_the_lamp_red_and_hides_its_numbers(
     wire: Wire,
 ) -> None:
-    shown = Scene(wire)
+    shown = ViewerScene(wire)
     shown.add(seen(0))
     shown.add(seen(1))
     green = values(wire.last(scene.LAMP), "colors")
@@ -145,7 +145,7 @@ def test_what_moves_is_shown_where_the_camera_takes_it() -> None:
 
 def test_a_recording_opens_arranged(tmp_path: Path) -> None:
     path = tmp_path / "walk.rrd"
-    recording = Recording(path, "walk", 3, np.zeros((2, 3)))
+    recording = RecordingWriter(path, "walk", 3, np.zeros((2, 3)))
     for index in range(3):
         recording.add(seen(index))
     recording.close()

@@ -30,7 +30,7 @@ from hybridvo.io.data.camera_file import parse_camera
 from hybridvo.io.data.registration import register_depth
 from hybridvo.io.data.sequence import UndistortionMaps
 from hybridvo.io.data.streams import (
-    Images,
+    FrameImages,
     Lens,
     StreamSequence,
     straightened,
@@ -431,7 +431,7 @@ class BagSequence(StreamSequence):
 
     # -- frames ------------------------------------------------------------------
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         try:
             rgb = ros.colour_image(
                 self._decoded(self.topics.rgb, self._rgb_at[index])

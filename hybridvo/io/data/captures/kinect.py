@@ -22,7 +22,12 @@ from hybridvo.core.types import Camera
 from hybridvo.io.data import lists
 from hybridvo.io.data.camera_file import parse_camera
 from hybridvo.io.data.image_io import as_pose, decode_bytes
-from hybridvo.io.data.streams import Images, Lens, StreamSequence, units_per_metre
+from hybridvo.io.data.streams import (
+    FrameImages,
+    Lens,
+    StreamSequence,
+    units_per_metre,
+)
 from hybridvo.io.data.two_cameras import TwoCameras
 
 SIGNS = (b"K4A_", b"k4arecord")
@@ -107,7 +112,7 @@ class KinectSequence(StreamSequence):
                 f"{path}: an Azure Kinect recording: PyAV is needed to read it: "
                 "pip install 'hybridvo[kinect]'."
             )
-        self._recording = recording = Recording(path)
+        self._recording = recording = KinectPackets(path)
         self._match()
         self._units = units_per_metre(self._given_scale, MILLIMETRES, self.warnings)
         colour, depth, T_colour_depth = calibration_of(
@@ -140,7 +145,7 @@ class KinectSequence(StreamSequence):
         self.timestamps = rgb[[i for i, _ in pairs]]
         self.depth_timestamps = depth[[j for _, j in pairs]]
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         where = f"{self._recording.path}: frame {index}"
         colour_time, depth_time = self._pairs[index]
         colour = self._recording.read("colour", colour_time, where)
@@ -186,7 +191,7 @@ class Track(NamedTuple):
     times: list[int]  # of its images, microseconds, increasing
 
 
-class Recording:
+class KinectPackets:
     """The packets of a recording, by track and time.
 
     Args:

@@ -27,7 +27,12 @@ from hybridvo.io.data.image_io import (
     read_rgb,
 )
 from hybridvo.io.data.sequence import in_metres
-from hybridvo.io.data.streams import Images, Lens, StreamSequence, units_per_metre
+from hybridvo.io.data.streams import (
+    FrameImages,
+    Lens,
+    StreamSequence,
+    units_per_metre,
+)
 from hybridvo.io.data.two_cameras import TwoCameras
 
 MILLIMETRES = 1000.0
@@ -117,7 +122,7 @@ class ScanNetSequence(StreamSequence):
                     return Camera.from_matrix(K, *size)
         return None
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         colour_size, depth_size = self._sizes
         rgb_file = self.rgb_files[index]
         depth_file = self.depth_files[index]
@@ -222,7 +227,7 @@ class SensSequence(StreamSequence):
         self._warn(f"no time stamps; {lists.assumed_rate(rate)}")
         return np.arange(len(self._frames)) / rate
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         frame = self._frames[index]
         where = f"{self._path}: frame {index}"
         with self._path.open("rb") as file:

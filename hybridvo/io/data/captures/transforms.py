@@ -20,7 +20,7 @@ from hybridvo.io.data.image_io import as_pose, image_size, read_depth, read_rgb
 from hybridvo.io.data.resize import resize_camera
 from hybridvo.io.data.sequence import UndistortionMaps, in_metres
 from hybridvo.io.data.streams import (
-    Images,
+    FrameImages,
     Lens,
     StreamSequence,
     check_lens,
@@ -45,7 +45,7 @@ PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 """Models without distortion, by their names in COLMAP and nerfstudio."""
 
 
-class View(NamedTuple):
+class FrameEntry(NamedTuple):
     """A frame of the file."""
 
     rgb: Path
@@ -128,7 +128,7 @@ class TransformsSequence(StreamSequence):
             )
         return content
 
-    def _views(self, content: dict[str, Any]) -> list[View]:
+    def _views(self, content: dict[str, Any]) -> list[FrameEntry]:
         """The frames in the order of the names of their images."""
         frames = [
             (self._file(frame.get("file_path"), "file_path"), frame)
@@ -136,7 +136,7 @@ class TransformsSequence(StreamSequence):
         ]
         frames.sort(key=lambda pair: lists.by_number(pair[0]))
         return [
-            View(
+            FrameEntry(
                 rgb,
                 self._depth_file(frame),
                 self._lens_of(content | frame, rgb),
@@ -163,7 +163,7 @@ class TransformsSequence(StreamSequence):
                 return self._file(frame[key], key)
         return None
 
-    def _with_depth(self, views: list[View]) -> list[View]:
+    def _with_depth(self, views: list[FrameEntry]) -> list[FrameEntry]:
         """The frames that have depth; an InputError where none has."""
         kept = [view for view in views if view.depth and view.depth.is_file()]
         if not kept:
@@ -234,7 +234,7 @@ class TransformsSequence(StreamSequence):
         kind = "equidistant" if is_fisheye else ""
         return check_lens(Lens(camera, distortion, kind), str(self._path))
 
-    def _take_sizes(self, views: list[View]) -> None:
+    def _take_sizes(self, views: list[FrameEntry]) -> None:
         """Find out the sizes of images and depth, and that of the frames."""
         first = views[0]
         self._image_size = image_size(first.rgb)
@@ -255,7 +255,7 @@ class TransformsSequence(StreamSequence):
         self._camera = self._cameras[0]
         self._maps: dict[Lens, UndistortionMaps | None] = {}
 
-    def _camera_of(self, view: View) -> Camera:
+    def _camera_of(self, view: FrameEntry) -> Camera:
         """The camera of a frame, at the size of the frames."""
         camera = view.lens.camera
         if camera.shape != self._image_size:
@@ -274,7 +274,7 @@ class TransformsSequence(StreamSequence):
             self._maps = {small: small.maps()}
         return self._maps[small]
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         view = self._views_read[index]
         height, width = self._frame_size
         size = (width, height)

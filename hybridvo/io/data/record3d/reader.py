@@ -18,7 +18,7 @@ from hybridvo.io.data.image_io import decode_bytes
 from hybridvo.io.data.lists import assumed_rate
 from hybridvo.io.data.record3d.archive import Archive
 from hybridvo.io.data.resize import resize_camera
-from hybridvo.io.data.streams import Images, StreamSequence
+from hybridvo.io.data.streams import FrameImages, StreamSequence
 
 KNOWN_DEPTH_SIZES = ((256, 192), (640, 480))
 """Height and width of the lidar's depth and of the front camera's, where the file names none."""
@@ -158,7 +158,7 @@ class Record3dSequence(StreamSequence):
                 poses[k] = make_transform(R, row[4:]) @ T_opengl_opencv
         return poses
 
-    def _images(self, index: int) -> Images:
+    def _images(self, index: int) -> FrameImages:
         number = self._numbers[index]
         height, width = self._frame_size
         size = (width, height)
@@ -170,7 +170,7 @@ class Record3dSequence(StreamSequence):
         rgb = self._rgb(number, self._image_size)
         small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         large = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        return Images(small, large)
+        return FrameImages(small, large)
 
     def _rgb(self, number: int, size: Any = None) -> np.ndarray:
         name = f"rgbd/{number}.jpg"

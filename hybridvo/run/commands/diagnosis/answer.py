@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Answer(NamedTuple):
+class Diagnosis(NamedTuple):
     """Whether data differs from what it should be."""
 
     differs: bool | None  # None: the data do not show it

@@ -24,7 +24,7 @@ from hybridvo.run.calibration import (
     MAX_CLOCK_STD_S,
     MIN_CLOCK_CORRELATION,
 )
-from hybridvo.run.commands.diagnosis.answer import Answer
+from hybridvo.run.commands.diagnosis.answer import Diagnosis
 
 # pairs in a row from which the clocks are compared: half a second
 MIN_CLOCK_PAIRS = 15
@@ -56,7 +56,7 @@ class Offset(NamedTuple):
     correlation: float  # of the two curves, at this offset
 
 
-def one_clock(sequence: Any, pairs: int) -> Answer:
+def one_clock(sequence: Any, pairs: int) -> Diagnosis:
     """Answer whether the stamps of colour and depth are of one clock.
 
     Args:
@@ -66,28 +66,30 @@ def one_clock(sequence: Any, pairs: int) -> Answer:
     measured = image_motions(sequence, pairs)
     if measured is None:
         count = MIN_CLOCK_PAIRS + 1
-        return Answer(None, f"fewer than {count} frames in a row have both")
+        return Diagnosis(None, f"fewer than {count} frames in a row have both")
     colour, depth = measured
     remedy = "turn the camera to and fro while you record"
     offset = find_offset(colour, depth)
     if offset is None or offset.correlation < MIN_CLOCK_CORRELATION:
         text = "colour and depth do not move alike: too little motion of the camera"
-        return Answer(None, f"{text}, or too much of other things: {remedy}")
+        return Diagnosis(None, f"{text}, or too much of other things: {remedy}")
     ms = 1000 * offset.seconds
     std_ms = 1000 * offset.std
     text = f"depth comes {abs(ms):.0f} +- {std_ms:.0f} ms "
     text += "after" if ms > 0 else "before"
     text += " colour, by the stamps"
     if offset.std > MAX_CLOCK_STD_S:
-        return Answer(None, f"{text}, too uncertain: {remedy}, at a higher rate")
+        return Diagnosis(None, f"{text}, too uncertain: {remedy}, at a higher rate")
     is_far = abs(offset.seconds) > MAX_CLOCK_OFFSET_S
     is_certain = abs(offset.seconds) > CLOCK_SIGMAS * offset.std
     if not (is_far and is_certain):
-        return Answer(False, text)
+        return Diagnosis(False, text)
     remedy = f"add {-ms:.0f} ms to the stamps of depth"
     if ms > 0:
         remedy = f"subtract {ms:.0f} ms from the stamps of depth"
-    return Answer(True, f"{text}: {remedy}, or let the camera synchronise the two")
+    return Diagnosis(
+        True, f"{text}: {remedy}, or let the camera synchronise the two"
+    )
 
 
 # -- the motion of images ----------------------------------------------------------------

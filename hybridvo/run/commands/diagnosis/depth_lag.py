@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hybridvo.run.commands.diagnosis.answer import Answer
+from hybridvo.run.commands.diagnosis.answer import Diagnosis
 from hybridvo.run.commands.diagnosis.clocks import middle_frames
 from hybridvo.tracking.depth_lag import find_lag
 
@@ -22,7 +22,7 @@ REMEDY = (
 )
 
 
-def depth_lag(sequence: Any, pairs: int) -> Answer:
+def depth_lag(sequence: Any, pairs: int) -> Diagnosis:
     """Answer whether image and depth of a frame are of one time.
 
     Args:
@@ -31,16 +31,16 @@ def depth_lag(sequence: Any, pairs: int) -> Answer:
     """
     lag = find_lag(middle_frames(sequence, pairs))
     if lag is None:
-        return Answer(None, f"too few turns of the camera show it: {REMEDY}")
+        return Diagnosis(None, f"too few turns of the camera show it: {REMEDY}")
     when = "after" if lag.ms > 0 else "before"
     text = (
         f"{lag.pairs} turns fit depth that is measured {abs(lag.ms):.0f} +- "
         f"{lag.std_ms:.0f} ms {when} the images"
     )
     if lag.std_ms > MAX_LAG_STD_MS:
-        return Answer(None, f"{text}, too uncertain: {REMEDY}")
+        return Diagnosis(None, f"{text}, too uncertain: {REMEDY}")
     stated_ms = sequence.frame(0).camera.depth_lag_ms
     off_ms = abs(lag.ms - stated_ms) - MIN_LAG_MS
     if off_ms < LAG_SIGMAS * lag.std_ms:
-        return Answer(False, text)
-    return Answer(None, f"{text}: state --depth-lag-ms {lag.ms:.0f}")
+        return Diagnosis(False, text)
+    return Diagnosis(None, f"{text}: state --depth-lag-ms {lag.ms:.0f}")

@@ -15,7 +15,7 @@ from hybridvo.run.calibration import (
     NEEDED_REGISTRATION_GAIN,
     NORMAL_REGISTRATION_SHIFT,
 )
-from hybridvo.run.commands.diagnosis.answer import Answer
+from hybridvo.run.commands.diagnosis.answer import Diagnosis
 from hybridvo.run.commands.diagnosis.inspection import (
     MAX_EDGE_DISPLACEMENT,
     edge_agreement,
@@ -37,19 +37,19 @@ class Shift(NamedTuple):
     down: int
 
 
-def registration(maps: list[np.ndarray]) -> Answer:
+def registration(maps: list[np.ndarray]) -> Diagnosis:
     """Answer whether the edges of depth lie on those of the images.
 
     Args:
         maps: Of some frames, as :func:`edge_agreement` returns them.
     """
     if not maps:
-        return Answer(None, "no frame has both an image and depth")
+        return Diagnosis(None, "no frame has both an image and depth")
     agreement = np.mean(np.stack(maps), axis=0)
     best = _best_shift(agreement)
     if best is None:
         causes = "too few or too soft, or depth is not registered to colour"
-        return Answer(
+        return Diagnosis(
             None,
             f"no shift brings the edges of depth onto those of the images: {causes}",
         )
@@ -63,16 +63,16 @@ def registration(maps: list[np.ndarray]) -> Answer:
     is_better = agreement.max() >= NEEDED_REGISTRATION_GAIN * near.max()
     if is_near:
         if best == Shift(0, 0):
-            return Answer(False, "edges of depth lie on those of the images")
+            return Diagnosis(False, "edges of depth lie on those of the images")
         # edges of depth are wide
-        return Answer(False, f"{text}, within the {radius} px that are usual")
+        return Diagnosis(False, f"{text}, within the {radius} px that are usual")
     if not is_better:
         text = (
             "edges of depth fit to those of the images nearly as well where they are as "
             f"{_in_words(best)} of there"
         )
-        return Answer(False, text)
-    return Answer(True, f"{text}: {REMEDY}, or crop and scale both alike")
+        return Diagnosis(False, text)
+    return Diagnosis(True, f"{text}: {REMEDY}, or crop and scale both alike")
 
 
 def _in_words(shift: Shift) -> str:
@@ -107,7 +107,7 @@ def _highest(agreement: np.ndarray) -> Shift:
 # -- depth of another focal length -------------------------------------------------------
 
 
-def zoomed_registration(sequence: Any) -> Answer | None:
+def zoomed_registration(sequence: Any) -> Diagnosis | None:
     """Answer whether depth is that of a camera with another focal length.
 
     Such depth agrees with the image nowhere but in its middle, and no shift helps.
@@ -133,7 +133,7 @@ def zoomed_registration(sequence: Any) -> Answer | None:
         f"depth fits to the images if it is scaled by {zoom:g}: it is that of a camera "
         f"with another focal length, too {size} by up to {border_px:.0f} px at the border"
     )
-    return Answer(True, f"{text}: {REMEDY}")
+    return Diagnosis(True, f"{text}: {REMEDY}")
 
 
 def _distributed_frames(sequence: Any) -> list[Frame]:

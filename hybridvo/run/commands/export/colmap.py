@@ -9,18 +9,20 @@ from scipy.spatial.transform import Rotation
 from hybridvo.core.files import make_folder, write_lines
 from hybridvo.core.geometry import invert
 from hybridvo.core.types import Camera
-from hybridvo.run.commands.export.views import Points, View
+from hybridvo.run.commands.export.views import ColouredPoints, PosedImage
 
 MODEL = ("cameras.txt", "images.txt", "points3D.txt")
 
 
-def write_colmap(folder: Path, views: list[View], points: Points) -> None:
+def write_colmap(
+    folder: Path, views: list[PosedImage], points: ColouredPoints
+) -> None:
     """Write a model: poses are world to camera, quaternions have w first, axes are OpenCV's.
 
     Args:
         folder: The folder of the model, such as ``sparse/0``.
         views: The images, which are numbered from 1.
-        points: Points, which no image refers to.
+        points: ColouredPoints, which no image refers to.
 
     Raises:
         OutputError: A file cannot be written.
@@ -34,7 +36,7 @@ def write_colmap(folder: Path, views: list[View], points: Points) -> None:
     write_lines(folder / MODEL[2], _point_lines(points))
 
 
-def _camera_lines(views: list[View], cameras: dict[Camera, int]) -> list[str]:
+def _camera_lines(views: list[PosedImage], cameras: dict[Camera, int]) -> list[str]:
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[fx fy cx cy]"]
     centres = {view.camera: view.centre for view in views}
     for camera, number in cameras.items():
@@ -44,7 +46,7 @@ def _camera_lines(views: list[View], cameras: dict[Camera, int]) -> list[str]:
     return lines
 
 
-def _image_lines(views: list[View], cameras: dict[Camera, int]) -> list[str]:
+def _image_lines(views: list[PosedImage], cameras: dict[Camera, int]) -> list[str]:
     lines = [
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
         "# POINTS2D[] as (X, Y, POINT3D_ID)",
@@ -61,7 +63,7 @@ def _image_lines(views: list[View], cameras: dict[Camera, int]) -> list[str]:
     return lines
 
 
-def _point_lines(points: Points) -> list[str]:
+def _point_lines(points: ColouredPoints) -> list[str]:
     lines = [
         "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"
     ]

@@ -25,8 +25,8 @@ from hybridvo.run.commands.export.transforms import (
 )
 from hybridvo.run.commands.export.views import (
     MAX_POINTS,
-    Points,
-    View,
+    ColouredPoints,
+    PosedImage,
     points_of,
 )
 
@@ -124,13 +124,15 @@ class RunExport:
             "points": len(points.xyz),
         }
 
-    def _views(self, trajectory: Trajectory) -> tuple[list[View], Points]:
+    def _views(
+        self, trajectory: Trajectory
+    ) -> tuple[list[PosedImage], ColouredPoints]:
         """The frames that did not fail, with their images on the disk, and points of some."""
         with np.load(self.out / "steps.npz", allow_pickle=False) as steps:
             indices = steps["index"].tolist()
             usable = (steps["status"] != "failed").tolist()
-        views = list[View]()
-        parts = list[Points]()
+        views = list[PosedImage]()
+        parts = list[ColouredPoints]()
         stride = -(-len(indices) // MAX_POINT_FRAMES)
         count = MAX_POINTS // -(-len(indices) // stride)
         for k, index in enumerate(indices):
@@ -142,11 +144,11 @@ class RunExport:
             if not (self.folder / IMAGES / name).is_file():
                 continue
             T = trajectory.T_world_cam[k]
-            views.append(View(name, self.sequence.camera(index), T))
+            views.append(PosedImage(name, self.sequence.camera(index), T))
             if gives_points and frame is not None:
                 mask = read_mask_png(self._mask_path(index), frame.camera.shape)
                 parts.append(points_of(frame, mask, T, count))
-        return views, Points.joined(parts)
+        return views, ColouredPoints.joined(parts)
 
     def _frame(self, index: int, always: bool) -> Frame | None:
         """Read a frame where that is wanted, or its image or mask is not on the disk yet."""

@@ -8,14 +8,18 @@ from typing import Any
 import numpy as np
 
 from hybridvo.core.files import write_json, write_lines
-from hybridvo.run.commands.export.views import Points, View
+from hybridvo.run.commands.export.views import ColouredPoints, PosedImage
 
 CLOUD = "points.ply"
 TRANSFORMS = "transforms.json"
 
 
 def write_transforms(
-    folder: Path, views: list[View], points: Points, images: str, masks: str
+    folder: Path,
+    views: list[PosedImage],
+    points: ColouredPoints,
+    images: str,
+    masks: str,
 ) -> None:
     """Write ``transforms.json`` as nerfstudio and instant-ngp read it, and the point cloud.
 
@@ -24,7 +28,7 @@ def write_transforms(
     Args:
         folder: The folder of the data set.
         views: The images.
-        points: Points in the same world frame.
+        points: ColouredPoints in the same world frame.
         images: The folder of the images, below it.
         masks: The folder of their masks, which are called as the images with ``.png`` appended.
 
@@ -53,7 +57,7 @@ def write_transforms(
     write_json(folder / TRANSFORMS, content | {"frames": frames})
 
 
-def _intrinsics(view: View) -> dict[str, Any]:
+def _intrinsics(view: PosedImage) -> dict[str, Any]:
     camera = view.camera
     cx, cy = view.centre
     return {
@@ -70,7 +74,7 @@ def _intrinsics(view: View) -> dict[str, Any]:
     }
 
 
-def _write_cloud(path: Path, points: Points) -> None:
+def _write_cloud(path: Path, points: ColouredPoints) -> None:
     lines = ["ply", "format ascii 1.0", f"element vertex {len(points.xyz)}"]
     lines += [f"property float {name}" for name in "xyz"]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")]

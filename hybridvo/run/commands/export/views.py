@@ -13,7 +13,7 @@ MAX_POINTS = 100_000
 """Points of an export: what a splat starts from."""
 
 
-class View(NamedTuple):
+class PosedImage(NamedTuple):
     """An image of a run with its pose."""
 
     name: str  # of the file, below the folder of the images
@@ -26,23 +26,23 @@ class View(NamedTuple):
         return self.camera.cx + 0.5, self.camera.cy + 0.5
 
 
-class Points(NamedTuple):
+class ColouredPoints(NamedTuple):
     """Points with colours."""
 
     xyz: np.ndarray  # (N, 3) metres, in the world frame
     rgb: np.ndarray  # (N, 3) uint8
 
     @classmethod
-    def joined(cls, parts: list[Points]) -> Points:
+    def joined(cls, parts: list[ColouredPoints]) -> ColouredPoints:
         """Return the points of all parts."""
-        none = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        none = ColouredPoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
         xyz, rgb = zip(none, *parts, strict=True)
         return cls(np.concatenate(xyz), np.concatenate(rgb))
 
 
 def points_of(
     frame: Frame, mask: np.ndarray, T_world_cam: np.ndarray, count: int
-) -> Points:
+) -> ColouredPoints:
     """Return points of a frame on a regular grid, without what its mask ignores.
 
     Args:
@@ -54,11 +54,11 @@ def points_of(
     depth = frame.depth
     rgb = frame.rgb
     if depth is None or rgb is None:
-        return Points.joined([])
+        return ColouredPoints.joined([])
     rows, columns = np.nonzero(valid_depth(depth) & mask)
     step = max(1, len(rows) // max(count, 1))
     index = np.column_stack([rows[::step], columns[::step]])
     points = backproject(depth, frame.camera, index)
     colours = rgb[index[:, 0], index[:, 1]].reshape(len(index), -1)
     xyz = transform_points(T_world_cam, points)
-    return Points(xyz, np.broadcast_to(colours, (len(index), 3)))
+    return ColouredPoints(xyz, np.broadcast_to(colours, (len(index), 3)))
