@@ -30,7 +30,7 @@ from bench.semi_real import (
 )
 from known_pairs import HEAVY
 from maker_pairs import CALIBRATION, FILMS, WITHOUT_FLOW, Film, Maker
-from measuring import ego_flow_error, parser_of
+from measuring import add_workers, ego_flow_error, parser_of
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
@@ -48,15 +48,15 @@ from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
 )
+from hybridvo.io.data.truth import true_motion
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
-from hybridvo.lab.calibration import WRONG_PX
-from hybridvo.lab.evaluation.scores import true_motion
-from hybridvo.lab.synthetic.noise_scenarios import SCENARIOS, make_pair
-from hybridvo.lab.synthetic.training_scenes import undetermined_pair
-from hybridvo.lab.training.validation import allowed_error_px, area_under_curve
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context, by_flow, run_method
 from hybridvo.tracking.memory import carried_to
+from hybridvo_lab.calibration import WRONG_PX
+from hybridvo_lab.synthetic.noise_scenarios import SCENARIOS, make_pair
+from hybridvo_lab.synthetic.training_scenes import undetermined_pair
+from hybridvo_lab.training.validation import allowed_error_px, area_under_curve
 
 HEAVY_SEEDS = range(900, 906)
 """Seeds of the heavy development scenes."""
@@ -143,6 +143,13 @@ def build_parser() -> argparse.ArgumentParser:
     add("--direct", action="store_true", help="fit the direct motions alone")
     add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
+    add(
+        "--numbers",
+        metavar="A,B",
+        help="try every other number with one of these in its name; ALL: all",
+    )
+    add("--out", type=Path, metavar="FILE", help="of --numbers")
+    add_workers(parser)
     return parser
 
 
@@ -151,6 +158,10 @@ def main(argv: list[str] | None = None) -> int:
     if args.cues:
         print(cue_weights(args))
         return 0
+    if args.numbers:
+        from number_fits import fit_numbers
+
+        return fit_numbers(args, argv)
     models = models_of(args.weights)
     rows: dict[str, list[Labelled]] = {}
 

@@ -2,25 +2,36 @@
 
     python tools/golden_mutations.py --list
     python tools/golden_mutations.py --numbers CHOICE_RIGHT --cases network
+    python tools/golden_mutations.py --find
 
 The first prints every change; the second makes those of one number and prints which of
-some cases notice. A change is undone before the next one is made.
+some cases notice; the third finds a case for each number that has none. A change is undone
+before the next one is made.
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import importlib
 import json
+import os
+import re
+import shutil
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from golden_cases.figures import Row, compare
 from golden_cases.quick import cases, measure_quick
 from measuring import ROOT, parser_of
+
+from hybridvo.core.errors import InputError
 
 FROZEN = ROOT / "docs/golden_quick.json"
 POSE_ERROR_RAD = 3e-4
@@ -33,7 +44,10 @@ ROOMS = (
     *("hybridvo.io", "hybridvo.run", "hybridvo_lab", "hybridvo_lab.baselines"),
 )
 """Rooms with numbers that decide."""
-OPTION_DEFAULTS = {"MIN_PROBABILITY": ("select", "min_probability")}
+OPTION_DEFAULTS = {
+    "MIN_PROBABILITY": ("select", "min_probability"),
+    "KERNEL_CUTOFF": ("refine", "cutoff"),
+}
 """Numbers that the code takes from the options: group and name of the option."""
 
 BEHAVIOUR_NOTICED_BY = {
@@ -43,75 +57,13 @@ BEHAVIOUR_NOTICED_BY = {
     "covariance times 4": "scenario_low_noise/classical",
 }
 """Change -> the case that must notice it."""
-NOTICED_BY: dict[str, tuple[float, str]] = {
-    # probabilities of being right
-    "CUES_RIGHT[0]": (DOWN, "heavy_ten/classical"),
-    "CUES_RIGHT[1]": (DOWN, "scenario_low_noise/classical"),
-    "NO_MOTION": (DOWN, "scenario_moving50/hybrid-flow"),
-    "CHOICE_RIGHT[0]": (DOWN, "scenario_moving50/hybrid-flow"),
-    "DIRECT_EXACT[0]": (DOWN, "static/hybrid"),
-    "DIRECT_OF_SCENE[0]": (DOWN, "static/hybrid"),
-    "CONTRADICTED_RIGHT": (DOWN, "contradicting_halved_flow/classical"),
-    # which motion is the camera's
-    "CUE_WEIGHTS[inlier_ratio]": (DOWN, "ladder_prior_of_an_object/classical"),
-    "CUE_WEIGHTS[flow_noise]": (DOWN, "heavy_ten/classical"),
-    "CUE_WEIGHTS[prior]": (DOWN, "ladder_prior_of_an_object/classical"),
-    "MIN_PROBABILITY": (UP, "heavy_rigid/hybrid"),
-    "DIRECT_PROBABILITY": (DOWN, "ladder_moving_patch/hybrid"),
-    "INLIER_REMOVAL_CUTOFF": (UP, "heavy_deforming/hybrid-flow"),
-    # flow
-    "DIS_NOISE[0]": (DOWN, "ladder_dis_flow/small_low"),
-    "DIS_NOISE[1]": (DOWN, "ladder_dis_flow/small_high"),
-    "FULL_RESOLUTION_MAX_PIXELS": (DOWN, "ladder_dis_flow/small_low"),
-    "MIN_TEXTURED": (DOWN, "ladder_little_texture/flow"),
-    "FLOW_CONTRADICTION[0]": (DOWN, "ladder_scaled_flow/classical"),
-    "FLOW_CONTRADICTION[1]": (DOWN, "ladder_noisy_negated_flow/classical"),
-    # inputs that contradict a motion
-    "MIN_LEAD": (DOWN, "ladder_turned_flow/slow"),
-    "IMAGE_LEAD": (UP, "ladder_turned_flow/fast"),
-    "IMAGE_LEAD_GAIN": (UP, "ladder_turned_flow/noisy"),
-    "DEPTH_LEAD": (DOWN, "ladder_late_depth/noisy"),
-    "DEPTH_LEAD_STD": (DOWN, "ladder_frozen_images/noisy_depth"),
-    "DOUBTFUL_SPREAD": (DOWN, "ladder_two_depths/spread"),
-    "NO_SPREAD": (DOWN, "ladder_two_depths/spread"),
-    # the tracker
-    "MIN_DEPTH_SHARE": (DOWN, "ladder_little_depth/classical"),
-    "KEYFRAME_FLOW": (DOWN, "walk_0/hybrid"),
-    "KEYFRAME_AGE": (DOWN, "walk_1/hybrid"),
-    "KEYFRAME_CORRELATION": (DOWN, "walk_0/hybrid"),
-    # covariance
-    "LONG_GROWTH[0]": (UP, "ladder_two_depths/scale"),
-    "LONG_GROWTH[1]": (UP, "ladder_two_depths/scale"),
-    "ABSORBED": (DOWN, "scenario_moving70/classical"),
-    "SHARED_BLOCK": (UP, "ladder_coherent_flow/medium"),
-    "MIN_TILES": (DOWN, "ladder_covered_tiles/classical"),
-    "WEAK_RATIO": (DOWN, "ladder_narrow_view/classical"),
-    # estimators of other libraries
-    "INLIER_STDS": (DOWN, "ladder_baseline_noise/half"),
-    "MIN_INLIER_PX": (DOWN, "ladder_baseline_noise/tiny"),
-    "UNSTATED_FLOW_STD_PX": (DOWN, "ladder_baseline_noise/unstated"),
-    # evaluation
-    "WRONG_PX": (DOWN, "ladder_evaluation/wrong"),
-    "TRUTH_NOISE[tum][0]": (DOWN, "ladder_evaluation/tum_at_20m"),
-    "TRUTH_NOISE[tum][1]": (DOWN, "ladder_evaluation/tum_at_0.2m"),
-    "TRUTH_NOISE[7scenes][0]": (DOWN, "ladder_evaluation/7scenes_at_20m"),
-    "TRUTH_NOISE[7scenes][1]": (DOWN, "ladder_evaluation/7scenes_at_0.2m"),
-    "TRUTH_NOISE[folder][0]": (DOWN, "ladder_evaluation/folder_at_20m"),
-    "TRUTH_NOISE[folder][1]": (DOWN, "ladder_evaluation/folder_at_0.2m"),
-    "TRUTH_NOISE[kitti][0]": (DOWN, "ladder_evaluation/kitti_at_20m"),
-    "TRUTH_NOISE[kitti][1]": (DOWN, "ladder_evaluation/kitti_at_0.2m"),
-    # the doctor
-    "MIN_VALID_DEPTH": (DOWN, "ladder_doctor/little_depth"),
-    "EMPTY_DEPTH": (DOWN, "ladder_doctor/empty_frames"),
-    "MIN_TEXTURE": (DOWN, "ladder_doctor/little_texture"),
-    "MIN_FOCUS": (UP, "ladder_doctor/blur"),
-    "NORMAL_REGISTRATION_SHIFT": (DOWN, "ladder_doctor/shifted_depth"),
-    "CERTAIN_REGISTRATION_STDS": (DOWN, "ladder_doctor/textured_surfaces"),
-    "NEEDED_REGISTRATION_GAIN": (UP, "ladder_doctor/partly_shifted"),
-    "STAMP_GAP_FACTOR": (DOWN, "ladder_doctor/late_by"),
-    "MAX_LATE_SHARE": (DOWN, "ladder_doctor/late_shares"),
+NOTICED = ROOT / "docs/golden_noticed.json"
+"""Number -> whether it goes up or down by a third, and the case that notices it; ``--find``."""
+FACTORS = {"down": DOWN, "up": UP}
+NOTICED_BY: dict[str, tuple[str, str]] = {
+    name: tuple(noticed)
+    for name, noticed in json.loads(NOTICED.read_text(encoding="utf-8")).items()
 }
-"""Fitted number -> the factor by which it is changed, the case that must notice it."""
 UNNOTICED: dict[str, str] = {
     "CUE_WEIGHTS[border_coverage]": "the selection changes on none of the pairs",
     "CUE_WEIGHTS[depth_extent]": "the selection changes on none of the pairs",
@@ -277,7 +229,7 @@ def with_leaf(value: Any, keys: tuple[Any, ...], factor: float) -> Any:
 
 
 def change_of_number(name: str, factor: float) -> Change:
-    """Return the change of one number of the calibration."""
+    """Return the change of one number of the calibrations."""
     constant, keys = fitted_numbers()[name]
     return Change(
         f"{name} times {factor:.2f}", lambda: number_changed(constant, keys, factor)
@@ -382,6 +334,184 @@ def noticed_by(change: Change, names: Sequence[str]) -> list[str]:
     return [line for line in findings if not line.startswith("better")]
 
 
+LIKELY: dict[str, tuple[str, ...]] = {
+    "hybridvo.solver.torch": ("scenario_moving50/pwvo-refine",),
+    "hybridvo.tracking.object": (
+        *("objects_heavy_ten_fast/hybrid", "objects_heavy_ten_slow/hybrid"),
+        "objects_light_fast/hybrid",
+    ),
+    "hybridvo.tracking.gyroscope": ("gyroscope/hybrid",),
+    "hybridvo.tracking.accelerometer": ("gravity/hybrid",),
+    "hybridvo.tracking.inertial": ("gyroscope/hybrid",),
+    "hybridvo.tracking.depth_scale": ("network_depth/hybrid",),
+    "hybridvo.tracking.relocalization": ("kidnapped/hybrid",),
+    "hybridvo.tracking": (
+        *("movers_heavy_two_slow/hybrid", "kidnapped/hybrid"),
+        "movers_heavy_ten_fast/hybrid",
+    ),
+    "hybridvo.run": ("ladder_doctor",),
+    "hybridvo_lab": ("ladder_evaluation", "ladder_baseline"),
+    "hybridvo": (
+        *("heavy_ten/hybrid", "scenario_moving70/classical"),
+        *("movers_heavy_two_slow/hybrid", "movers_heavy_ten_fast/hybrid"),
+    ),
+}
+"""Module -> words in the names of the cases that may notice its numbers."""
+
+
+def find_who_notices(words: str) -> None:
+    """Change numbers that nobody has said anything of, and keep which case notices each."""
+    load_all()
+    known = list(cases())
+    for name in unchecked_numbers():
+        if words and not any(word in name for word in words.split(",")):
+            continue
+        constant = fitted_numbers()[name][0]
+        if constant in compiled_constants():
+            print(f"{name}: frozen into a compiled kernel", flush=True)
+            continue
+        likely = likely_to_notice(constant)
+        wanted = [case for case in known if any(word in case for word in likely)]
+        found = first_that_notices(name, wanted)
+        print(f"{name}: {found or 'not noticed'}", flush=True)
+        if found is not None:
+            keep_noticed(name, found)
+
+
+def first_that_notices(name: str, wanted: Sequence[str]) -> tuple[str, str] | None:
+    """The direction and the case in which a change of a number is noticed first."""
+    for case in wanted:
+        for direction, factor in FACTORS.items():
+            try:
+                if noticed_by(change_of_number(name, factor), [case]):
+                    return direction, case
+            # a third more of it is no valid value
+            except (InputError, ValueError):
+                continue
+    return None
+
+
+# -- numbers that are frozen into kernels, or into other numbers ---------------
+
+
+def find_in_a_copy(words: str) -> None:
+    """Change numbers in a copy of the package, where all that rests on them is made anew."""
+    load_all()
+    known = list(cases())
+    chosen = [
+        name
+        for name in unchecked_numbers()
+        if not words or any(word in name for word in words.split(","))
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder)
+        for part in ("hybridvo", "hybridvo_lab", "tools", "configs"):
+            shutil.copytree(ROOT / part, copy / part)
+        (copy / "docs").mkdir()
+        shutil.copy(FROZEN, copy / "docs")
+        shutil.copy(NOTICED, copy / "docs")
+        for name in chosen:
+            likely = likely_to_notice(fitted_numbers()[name][0])
+            wanted = [
+                case for case in known if any(word in case for word in likely)
+            ]
+            found = None
+            for direction, factor in FACTORS.items():
+                case = noticed_in(copy, name, factor, wanted)
+                if case is not None:
+                    found = direction, case
+                    break
+            print(f"{name}: {found or 'not noticed'}", flush=True)
+            if found is not None:
+                keep_noticed(name, found)
+
+
+def noticed_in(
+    copy: Path, name: str, factor: float, wanted: Sequence[str]
+) -> str | None:
+    """The first case that notices a number that is changed in the sources of a copy."""
+    constant, keys = fitted_numbers()[name]
+    path = next(
+        path
+        for path in sorted(copy.rglob("calibration.py"))
+        if re.search(rf"^{constant} = ", path.read_text("utf-8"), re.MULTILINE)
+    )
+    before = path.read_text("utf-8")
+    path.write_text(edited(before, constant, keys, factor), "utf-8")
+    command = [
+        sys.executable,
+        "tools/golden.py",
+        "--quick",
+        "--only",
+        ",".join(wanted),
+    ]
+    environment = os.environ | {"PYTHONPATH": str(copy)}
+    done = subprocess.run(
+        command,
+        cwd=copy,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    path.write_text(before, "utf-8")
+    lines = done.stdout.splitlines()
+    if not lines or not lines[-1].startswith("golden:"):
+        # a third more of it is no valid value
+        return None
+    found = [line for line in lines[:-1] if not line.startswith("better")]
+    return found[0].split()[1].rstrip(":") if found else None
+
+
+def edited(text: str, constant: str, keys: tuple[Any, ...], factor: float) -> str:
+    """A source in which one number of a constant is multiplied.
+
+    >>> edited("A = (1, -2.0)", "A", (1,), 3.0)
+    'A = (1, -6.0)'
+    """
+    for node in ast.parse(text).body:
+        is_it = (
+            isinstance(node, ast.Assign)
+            and ast.unparse(node.targets[0]) == constant
+        )
+        if not is_it:
+            continue
+        value: Any = node.value
+        for key in keys:
+            if isinstance(value, ast.Dict):
+                names = [ast.literal_eval(each) for each in value.keys if each]
+                value = value.values[names.index(key)]
+            else:
+                value = value.elts[key]
+        old = ast.get_source_segment(text, value) or ""
+        lines = text.splitlines(keepends=True)
+        start = sum(map(len, lines[: value.lineno - 1])) + value.col_offset
+        new = with_leaf(ast.literal_eval(value), (), factor)
+        return f"{text[:start]}{new!r}{text[start + len(old) :]}"
+    raise ValueError(constant)
+
+
+def keep_noticed(name: str, found: tuple[str, str]) -> None:
+    """Write down which case notices a number."""
+    noticed = json.loads(NOTICED.read_text(encoding="utf-8"))
+    noticed[name] = found
+    NOTICED.write_text(f"{json.dumps(noticed, indent=1)}\n", encoding="utf-8")
+
+
+def likely_to_notice(constant: str) -> set[str]:
+    """Words in the names of the cases that may notice a number, by the modules that use it."""
+    users = [
+        module.__name__
+        for module in own_modules()
+        if constant in vars(module) and not module.__name__.endswith("calibration")
+    ]
+    words: set[str] = set()
+    for user in users:
+        most = max((name for name in LIKELY if user.startswith(name)), key=len)
+        words.update(LIKELY[most])
+    return words
+
+
 def load_all() -> None:
     """Import what the methods import when they run, and compile the kernels."""
     import pkgutil
@@ -406,6 +536,16 @@ def main(argv: list[str] | None = None) -> int:
     parser = parser_of(__file__, __doc__)
     parser.add_argument("--list", action="store_true", help="print every change")
     parser.add_argument(
+        "--find",
+        action="store_true",
+        help="find the case that notices each number without one, and keep it",
+    )
+    parser.add_argument(
+        "--in-a-copy",
+        action="store_true",
+        help="with --find: change the sources of a copy, for numbers that are frozen into others",
+    )
+    parser.add_argument(
         "--unchecked",
         action="store_true",
         help="print numbers that have no case yet",
@@ -425,6 +565,10 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if args.unchecked:
         print(*unchecked_numbers(), sep="\n")
+        return 0
+    if args.find:
+        find = find_in_a_copy if args.in_a_copy else find_who_notices
+        find(args.numbers)
         return 0
     chosen = [
         change_of_number(name, factor)

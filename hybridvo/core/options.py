@@ -21,7 +21,6 @@ from hybridvo.core.calibration import (
     MIN_PROBABILITY,
 )
 from hybridvo.core.errors import FormatError, InputError, did_you_mean
-from hybridvo.core.files import parse_yaml, read_text
 
 T = TypeVar("T")
 Positive = Annotated[float, Field(gt=0)]
@@ -362,6 +361,9 @@ def load_options(
 
 def _read_groups(path: str | Path) -> dict[str, Any]:
     """Read the groups of a YAML file of options."""
+    # a tracker needs no reader
+    from hybridvo.core.files import parse_yaml, read_text
+
     try:
         text = read_text(path)
     except FileNotFoundError:
@@ -376,6 +378,8 @@ def _read_groups(path: str | Path) -> dict[str, Any]:
 
 def _assignment(text: str) -> tuple[str, Any]:
     """Split ``group.key=value`` and read the value as YAML."""
+    from hybridvo.core.files import parse_yaml
+
     key, sign, value = text.partition("=")
     if not sign or "." not in key:
         raise InputError(

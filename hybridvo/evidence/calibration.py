@@ -1,4 +1,10 @@
-"""Numbers of the evidence of a pair that decide: value, unit, data, how to find them again."""
+"""Numbers of the evidence of a pair that decide: value, unit, data, how to find them again.
+
+Where a number names neither data nor a command, it was chosen by hand. What a third and three times
+of it do on eleven makers stands in docs/results/numbers.json (``tools/calibrate.py --numbers
+NAME``: what is chosen for a maker is chosen on all others), and which golden case notices a third
+of it in docs/golden_noticed.json.
+"""
 
 # Wide steps
 
@@ -11,4 +17,4 @@ turned windows; ``tools/benchmark.py wide_steps``). It saves 350 ms of a step th
 
 NEGLIGIBLE_SHIFT_PX = 0.05
 """By how much the times of the rows must move some pixel, px, or the image stays as it is: below
-the noise of a motion by images. Unfitted."""
+the noise of a motion by images."""

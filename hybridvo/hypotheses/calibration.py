@@ -1,4 +1,10 @@
-"""Numbers of the sources of motions that decide: value, unit, data, how to find them again."""
+"""Numbers of the sources of motions that decide: value, unit, data, how to find them again.
+
+Where a number names neither data nor a command, it was chosen by hand. What a third and three times
+of it do on eleven makers stands in docs/results/numbers.json (``tools/calibrate.py --numbers
+NAME``: what is chosen for a maker is chosen on all others), and which golden case notices a third
+of it in docs/golden_noticed.json.
+"""
 
 NO_MOTION = -2.0
 """PWVO's score of no motion being the camera's. In training it was 0, with which two equal
@@ -62,14 +68,14 @@ counts: above the noise of usual cameras."""
 
 FRACTION_EVIDENCE = 2.5
 """Nats of evidence for each nat by which the fraction of what was static that follows a motion
-exceeds that of what moved. Unfitted."""
+exceeds that of what moved."""
 FRACTION_FLOOR = 0.05
-"""Added to fractions before their logarithm is taken. Unfitted."""
+"""Added to fractions before their logarithm is taken."""
 MEMORY_DEAD_ZONE = 0.3
 """Nats by which a motion may fit the memory worse than the best at no cost. By hand: without it 14
 instead of 9 steps of a turning Kinect (``tum/rgbd_dataset_freiburg1_rpy_100``) are degraded."""
 MEMORY_SURE = 0.995
-"""Probability that the memory is right, which bounds its evidence. Unfitted."""
+"""Probability that the memory is right, which bounds its evidence."""
 
 # Images alone
 

@@ -43,7 +43,7 @@ are wrong and ``ok`` (``tools/benchmark.py memory_unseen``, without memory), and
 of 60, while a turning Kinect needs flow in 29 instead of 41 of 99 frames."""
 WITHOUT_IMAGES_RIGHT = 0.5
 """Probability of a motion that no image confirms: by depth maps alone, where all points are in view
-and follow it, or as it was expected. Unfitted."""
+and follow it, or as it was expected."""
 MIN_LEAD = 0.0025
 """Mean flow, fraction of the width, by which images or depth maps must lead away from a motion at
 least before they contradict it: 1.6 px of 640."""
@@ -84,11 +84,10 @@ EXACT_SURFACE = 2e-3
 view 64 % at most do (``data/real_static/rooms_110``, frames 79 to 89, structured light), of a
 D435's 40 %."""
 MIN_ON_SURFACE = 0.78
-"""Fraction of the pixels with depth that must lie on it. Unfitted: most of them, beside holes and
+"""Fraction of the pixels with depth that must lie on it. Most of them, beside holes and
 edges that were filled otherwise."""
 OFF_SURFACE_PX = 0.5
-"""Distance between the flow and that of the surface, px, below which a pixel moves with it.
-Unfitted; so are the next three."""
+"""Distance between the flow and that of the surface, px, below which a pixel moves with it."""
 OFF_SURFACE_FLOW = 0.02
 """The same as a fraction of the flow: what the surface's inexactness may add."""
 OFF_SURFACE_GAIN = 1.5

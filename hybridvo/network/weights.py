@@ -23,7 +23,6 @@ from torch import nn
 from hybridvo.core import laboratory
 from hybridvo.core.checks import brief
 from hybridvo.core.errors import CheckpointError, InputError
-from hybridvo.core.files import atomic_write
 
 FORMAT = "hybridvo-network-2"
 """Value of the header's key ``format``."""
@@ -58,6 +57,9 @@ def save_weights(
         InputError: a weight is not finite.
         OutputError: the file cannot be written.
     """
+    # a tracker writes nothing
+    from hybridvo.core.files import atomic_write
+
     options = asdict(network.options)  # type: ignore[call-overload]
     header = {
         "options": _to_json(options),

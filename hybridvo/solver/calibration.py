@@ -1,8 +1,14 @@
-"""Numbers of the solver that decide: value, unit, data, how to find them again."""
+"""Numbers of the solver that decide: value, unit, data, how to find them again.
+
+Where a number names neither data nor a command, it was chosen by hand. What a third and three times
+of it do on eleven makers stands in docs/results/numbers.json (``tools/calibrate.py --numbers
+NAME``: what is chosen for a maker is chosen on all others), and which golden case notices a third
+of it in docs/golden_noticed.json.
+"""
 
 AGREEMENT_RIGHT = 0.25
 """Weight of the log of how far a refined motion agrees with the one that was chosen, beside the
-log odds of the choice. Unfitted there: fitted on 458 answers beside a margin alone."""
+log odds of the choice. It was fitted on 458 answers beside a margin alone."""
 
 # Below, without a unit: fitted on the development seeds of the scenarios
 # (``tools/benchmark.py methods``), on rendered walks with DIS flow, and on the real samples.
@@ -67,13 +73,13 @@ plane over 20 degrees has 1e-4, a patch of 20 px at fx = 1120 has 1e-5."""
 
 SEED_STDS = 2.0
 """Largest first scale of the robust kernel from a seed, in standard deviations of where it puts
-the pixels, by the covariance that its giver states. Unfitted."""
+the pixels, by the covariance that its giver states."""
 SEED_SCALE_PX = 1.0
 """The same from a seed without a covariance, px. Of 98 pairs of the kitchen clips 16 are wrong
 before the images with it, 20 from about 2 px, 23 from ``SCALE_PER_RESIDUAL`` medians."""
 SEED_FRACTION = 0.05
 """Unless fewer of the surest pixels than this fraction fit the seed so well: then it is off by as
-much as their residuals show. Unfitted."""
+much as their residuals show."""
 FLOW_NOISE_CAP_PX = 1.2
 """Largest noise of the flow that a single motion may have during a search, px."""
 DEPTH_NOISE_CAP = 0.08
@@ -178,9 +184,9 @@ MIN_SEEN_OF_REGION = 0.4
 """Fraction of a region's points that must be seen, by their weight."""
 MAX_HIDDEN = 0.5
 """Fraction of what is believed static that something nearer may hide, or of which no depth is
-measured any more. Unfitted: an absurd motion hides everything behind what stands before it."""
+measured any more. An absurd motion hides everything behind what stands before it."""
 MIN_BELIEVED = 0.5
-"""Weight by a belief from which a pixel takes part in the refinement. Unfitted."""
+"""Weight by a belief from which a pixel takes part in the refinement."""
 
 # Poses of patches, and the region of a seed
 #
@@ -188,7 +194,7 @@ MIN_BELIEVED = 0.5
 # ``tools/benchmark.py pwvo_parts`` measures today.
 
 PATCH_PRIOR_RAD = 0.05
-"""Standard deviation of a patch's pose where its pixels leave it open, as an angle. Unfitted."""
+"""Standard deviation of a patch's pose where its pixels leave it open, as an angle."""
 AGREEMENT_CUTOFF = 2.0
 """Distance of a patch from the fused pose, in typical ones, at which it counts a quarter."""
 LARGEST_SEED_DISTANCE2 = 10.0
@@ -201,8 +207,7 @@ whose seeds are right."""
 # Where a point lies before or behind what another frame measures
 
 DEPTH_NOISE_M = 0.003
-"""Standard deviation of a difference of depths of one surface: of the depth. Unfitted, so are the
-next three."""
+"""Standard deviation of a difference of depths of one surface: of the depth."""
 DEPTH_NOISE_PER_M = 0.002
 """The same, of its square, 1 / m: what structured light adds."""
 DEPTH_NOISE_SIGMAS = 1.4

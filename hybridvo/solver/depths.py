@@ -24,7 +24,7 @@ from hybridvo.solver.kernels import FASTMATH, MAX_VALUE, MIN_DEPTH, W
 
 # Points that are compared, about.
 COMPARED = 2000
-# Robust weight above which a pixel's depth is compared; unfitted.
+# Robust weight above which a pixel's depth is compared.
 COMPARED_WEIGHT = 0.5
 # Metres: what lies outside of them is no measurement.
 SMALLEST_DEPTH = 1e-6

@@ -619,7 +619,7 @@ class _Segmentation:
         fraction = MIN_OBJECT * size / np.count_nonzero(cells)
         search = replace(
             self.options.search,
-            min_inlier_ratio=float(np.clip(fraction, *LEAST_OF_SEARCHED)),
+            min_inlier_ratio=float(np.clip(fraction, LEAST_OF_SEARCHED, 1.0)),
         )
         options = replace(self.options, search=search)
         starts = np.stack([np.eye(4), invert(self.view.before.T_curr_prev)])

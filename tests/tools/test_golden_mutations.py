@@ -39,8 +39,8 @@ def test_a_change_of_behaviour_is_noticed(name, case):
 @pytest.mark.long
 @pytest.mark.parametrize("name", mutations.NOTICED_BY, ids=ids)
 def test_a_fitted_number_changed_by_a_third_is_noticed(name):
-    factor, case = mutations.NOTICED_BY[name]
-    change = mutations.change_of_number(name, factor)
+    direction, case = mutations.NOTICED_BY[name]
+    change = mutations.change_of_number(name, mutations.FACTORS[direction])
     assert mutations.noticed_by(change, [case])
 
 
@@ -62,6 +62,14 @@ def test_every_case_that_must_notice_is_frozen():
     frozen = json.loads((ROOT / "docs/golden_quick.json").read_text("utf-8"))
     assert set(cases_that_notice()) <= set(frozen["cases"])
     assert list(frozen["cases"]) == list(golden_quick.cases())
+
+
+def test_one_number_of_a_source_is_edited():
+    text = "A = 0.3\nB = {'x': (3, -4.0)}\n"
+    assert mutations.edited(text, "B", ("x", 1), 0.5) == text.replace(
+        "-4.0", "-2.0"
+    )
+    assert mutations.edited(text, "A", (), 2.0) == text.replace("0.3", "0.6")
 
 
 def test_a_change_is_undone():

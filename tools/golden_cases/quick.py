@@ -19,6 +19,7 @@ import numpy as np
 from known_pairs import HEAVY, UNDETERMINED, degenerate
 from measuring import ego_flow_error
 
+from golden_cases import followed
 from golden_cases.figures import Record, Row, labelled, record, spread, summarise
 from golden_cases.ladders import LADDERS
 from golden_cases.scenes import (
@@ -84,6 +85,7 @@ def cases() -> dict[str, Run]:
     runs |= {
         f"ladder_{name}/{method}": run for (name, method), run in LADDERS.items()
     }
+    runs |= followed.cases()
     for kind in (None, *PRIOR_STD):
         for method in PRIOR_METHODS:
             runs[f"prior_{kind or 'none'}/{method}"] = partial(
