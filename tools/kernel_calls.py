@@ -154,7 +154,7 @@ def main(argv: list[str] | None = None) -> int:
         from hybridvo_lab.commands.demo import demo_frames
 
         call_all()
-        demo_frames(1)
+        demo_frames(2)
         write_table(signatures(hybridvo))
         write_table(signatures(hybridvo_lab), hybridvo_lab.KERNELS)
         return 0

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from numba.core import types
 
+import hybridvo_lab
 from hybridvo.compiled import ahead_of_time
 from hybridvo.solver.noise_estimation import Noise
 from tests.scripts import ROOT
@@ -68,8 +69,11 @@ CALLED = """
 import json
 from tests.scripts import load_script
 calls = load_script("tools/kernel_calls.py")
+import hybridvo, hybridvo_lab
+from hybridvo_lab.commands.demo import demo_frames
 calls.call_all()
-print(json.dumps(calls.signatures()))
+demo_frames(2)
+print(json.dumps(calls.signatures(hybridvo) | calls.signatures(hybridvo_lab)))
 """
 
 WITHOUT = """
@@ -131,6 +135,7 @@ def test_the_next_process_compiles_nothing(tmp_path):
 def test_the_table_has_all_that_the_package_calls(tmp_path):
     called = json.loads(run(ROOT, "-c", CALLED).stdout)
     table = ahead_of_time.read_table()
+    table |= ahead_of_time.read_table(hybridvo_lab.KERNELS)
     missing = {
         name: [entry for entry in signatures if entry not in table.get(name, [])]
         for name, signatures in called.items()
