@@ -58,6 +58,11 @@ def test_something_worse_is_named(change):
     assert words(figures(CASE), figures(CASE | change)) == ["WORSE"]
 
 
+def test_answers_where_there_were_none_have_an_error_that_is_named():
+    before = figures(CASE | {"nees": None})
+    assert words(before, figures(CASE | {"nees": 90.0})) == ["WORSE"]
+
+
 @pytest.mark.parametrize(
     "change",
     [{}, {"median": 0.0649}, {"worst": 0.59}, {"overconfident": 1}, {"nees": 7.0}],

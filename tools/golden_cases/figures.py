@@ -182,9 +182,7 @@ def judge_beside(old: Row, new: Row, factor: float) -> list[Finding]:
     wider = now > before and (new["nees"] or 0) < EXPECTED_NEES
     worse = miss(new["nees"]) > miss(old["nees"]) + math.log(NEES_FACTOR)
     if worse and not wider:
-        found.append(
-            ("WORSE", f"normalised error {old['nees']:.3g} -> {new['nees']:.3g}")
-        )
+        found.append(("WORSE", f"normalised error {old['nees']} -> {new['nees']}"))
     return found + judge_stated(old, new)
 
 
