@@ -272,9 +272,13 @@ def _covariance(
 ) -> MotionCovariance:
     """Return the covariance of a motion (4, 4) from the linearization at its solution."""
     shared = _shared_errors(grid, at, T[:3], noise, options)
-    statistics = ScoreStatistics(at.tiles, at.curvature, at.meat, shared)
+    statistics = ScoreStatistics(
+        at.tiles, at.curvature, at.meat, at.external_sum, shared
+    )
     inverse_depth = robust_fit.translation_scale(grid.samples, grid.count)
-    return motion_covariance(statistics, inverse_depth, T[:3, 3], noise, depths)
+    return motion_covariance(
+        statistics, inverse_depth, float(grid.K[0]), T[:3, 3], noise, depths
+    )
 
 
 def _shared_errors(

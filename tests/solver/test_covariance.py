@@ -73,8 +73,9 @@ def answer(
     pulls = np.zeros((ROWS, COLUMNS, 3, 6))
     pulls[:, :, :2] = residual.std() * to_tiles(J)
     shared = SharedErrors(pulls, coherent)
-    statistics = ScoreStatistics(tiles, np.zeros((6, 6)), meat, shared)
-    found = motion_covariance(statistics, 1.0, np.zeros(3), Noise(1.0, 0.0), None)
+    statistics = ScoreStatistics(tiles, np.zeros((6, 6)), meat, 1.0, shared)
+    still = np.zeros(3)
+    found = motion_covariance(statistics, 1.0, 300.0, still, Noise(1.0, 0.0), None)
     assert found.tiles == ROWS * COLUMNS
     return motion, found.covariance
 
@@ -178,12 +179,17 @@ def test_every_error_has_a_name_and_their_sum_is_the_covariance() -> None:
     pulls = np.zeros((ROWS, COLUMNS, 3, 6))
     pulls[:, :, :2] = to_tiles(J)
     statistics = ScoreStatistics(
-        tiles, np.zeros((6, 6)), H, SharedErrors(pulls, 0.1)
+        tiles, np.zeros((6, 6)), H, 400.0, SharedErrors(pulls, 0.1)
     )
     t = np.array([0.1, 0.0, -0.2])
     depths = DepthAgreement(ratio=1.3, log_deviation=0.0)
-    found = motion_covariance(statistics, 0.5, t, Noise(1.0, 0.3), depths)
-    assert len(found.errors) == 4
+    found = motion_covariance(statistics, 0.5, 300.0, t, Noise(1.0, 0.3), depths)
+    assert len(found.errors) == 5
+    # 400 pixels that are rounded alike by 2e-5 px, beside px of flow and parallax by log depth
+    parallax = 300.0 * np.linalg.norm(t) * 0.5
+    fraction = 400 * 2e-5**2 / (1 + (0.3 * parallax) ** 2)
+    rounding = found.errors["of rounding"]
+    np.testing.assert_allclose(rounding, fraction * np.linalg.inv(H), rtol=1e-6)
     for error in found.errors.values():
         # none of them makes a motion surer, and none is there for nothing
         smallest = np.linalg.eigvalsh(error)[0]

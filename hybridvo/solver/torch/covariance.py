@@ -84,7 +84,9 @@ def batch_covariances(
         _coherent_fractions(batch, pixels, matrix, model, options),
         fit.curvature,
         fit.meat,
+        pixels.total,
         _inverse_depth(fit.subset),
+        pixels.K[:, 0, 0],
         fit.T.translation(),
         model.noise,
     )
@@ -196,18 +198,21 @@ def _sample_covariance(
     coherent: np.ndarray,
     curvature: np.ndarray,
     meat: np.ndarray,
+    weight: np.ndarray,
     inverse_depth: np.ndarray,
+    focal: np.ndarray,
     t: np.ndarray,
     noise: np.ndarray,
 ) -> MotionCovariance:
     """Return the covariance of one motion; no tiles where it is not finite."""
     shared = SharedErrors(pulls, float(coherent))
-    values = (*shared, tiles, curvature, meat, inverse_depth, t, noise)
+    scalars = (weight, inverse_depth, focal)
+    values = (*shared, tiles, curvature, meat, *scalars, t, noise)
     if not all(np.isfinite(x).all() for x in values):
         return unknown_motion(np.zeros(6))
-    statistics = ScoreStatistics(tiles, curvature, meat, shared)
+    statistics = ScoreStatistics(tiles, curvature, meat, float(weight), shared)
     return motion_covariance(
-        statistics, float(inverse_depth), t, Noise(*noise), depths
+        statistics, float(inverse_depth), float(focal), t, Noise(*noise), depths
     )
 
 
