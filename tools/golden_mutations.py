@@ -58,10 +58,20 @@ BEHAVIOUR_NOTICED_BY = {
 }
 """Change -> the case that must notice it."""
 NOTICED = ROOT / "docs/golden_noticed.json"
-"""Number -> whether it goes up or down by a third, and the case that notices it; ``--find``."""
+"""Number -> what :class:`Noticed` says; ``--find`` writes it."""
 FACTORS = {"down": DOWN, "up": UP}
-NOTICED_BY: dict[str, tuple[str, str]] = {
-    name: tuple(noticed)
+
+
+class Noticed(NamedTuple):
+    """How a number is changed, and who notices."""
+
+    direction: str  # down or up by a third
+    case: str
+    in_a_copy: bool  # of the sources: it is frozen into kernels or other numbers
+
+
+NOTICED_BY = {
+    name: Noticed(*noticed)
     for name, noticed in json.loads(NOTICED.read_text(encoding="utf-8")).items()
 }
 UNNOTICED: dict[str, str] = {
@@ -169,20 +179,22 @@ def widened(answer: Any) -> Any:
 # -- changes of numbers --------------------------------------------------------
 
 
-def fitted_numbers() -> dict[str, tuple[str, tuple[Any, ...]]]:
+def fitted_numbers(
+    rooms: Sequence[str] = ROOMS,
+) -> dict[str, tuple[str, tuple[Any, ...]]]:
     """Return every number of the calibrations: its name -> that of the constant, the keys."""
     found: dict[str, tuple[str, tuple[Any, ...]]] = {}
-    for constant, value in calibrated().items():
+    for constant, value in calibrated(rooms).items():
         for keys in leaves(value):
             name = constant + "".join(f"[{key}]" for key in keys)
             found[name] = constant, keys
     return found
 
 
-def calibrated() -> dict[str, Any]:
+def calibrated(rooms: Sequence[str] = ROOMS) -> dict[str, Any]:
     """Return the constants of the ``calibration.py`` of every room."""
     found: dict[str, Any] = {}
-    for room in ROOMS:
+    for room in rooms:
         module = importlib.import_module(f"{room}.calibration")
         found |= {
             name: value for name, value in vars(module).items() if name.isupper()
@@ -359,108 +371,91 @@ LIKELY: dict[str, tuple[str, ...]] = {
 """Module -> words in the names of the cases that may notice its numbers."""
 
 
-def find_who_notices(words: str) -> None:
-    """Change numbers that nobody has said anything of, and keep which case notices each."""
+def find_who_notices(words: str, in_a_copy: bool) -> None:
+    """Change numbers that nobody has said anything of, and keep which case notices each.
+
+    Args:
+        words: in the names of the numbers, between commas; empty: all.
+        in_a_copy: whether the sources of a copy are changed, so that all that rests on a number is
+            made anew: kernels, and other numbers.
+    """
     load_all()
-    known = list(cases())
     for name in unchecked_numbers():
-        if words and not any(word in name for word in words.split(",")):
+        if words and not named(name, words):
             continue
-        constant = fitted_numbers()[name][0]
-        if constant in compiled_constants():
-            print(f"{name}: frozen into a compiled kernel", flush=True)
-            continue
-        likely = likely_to_notice(constant)
-        wanted = [case for case in known if any(word in case for word in likely)]
-        found = first_that_notices(name, wanted)
+        likely = likely_to_notice(fitted_numbers()[name][0])
+        wanted = [case for case in cases() if any(word in case for word in likely)]
+        found = first_that_notices(name, wanted, in_a_copy)
         print(f"{name}: {found or 'not noticed'}", flush=True)
         if found is not None:
             keep_noticed(name, found)
 
 
-def first_that_notices(name: str, wanted: Sequence[str]) -> tuple[str, str] | None:
-    """The direction and the case in which a change of a number is noticed first."""
-    for case in wanted:
-        for direction, factor in FACTORS.items():
-            try:
-                if noticed_by(change_of_number(name, factor), [case]):
-                    return direction, case
-            # a third more of it is no valid value
-            except (InputError, ValueError):
-                continue
+def first_that_notices(
+    name: str, wanted: Sequence[str], in_a_copy: bool
+) -> Noticed | None:
+    """The direction in which a change of a number is noticed first, and the case."""
+    for direction in FACTORS:
+        for some in [wanted] if in_a_copy else [[case] for case in wanted]:
+            found = who_notices(name, direction, some, in_a_copy)
+            if found:
+                return Noticed(
+                    direction, found[0].split()[1].rstrip(":"), in_a_copy
+                )
     return None
 
 
-# -- numbers that are frozen into kernels, or into other numbers ---------------
+def who_notices(
+    name: str, direction: str, wanted: Sequence[str], in_a_copy: bool
+) -> list[str]:
+    """What some cases find while a number is changed; nothing where it has no such value."""
+    factor = FACTORS[direction]
+    if in_a_copy:
+        with tempfile.TemporaryDirectory() as folder:
+            return noticed_in(copied(Path(folder)), name, factor, wanted)
+    try:
+        return noticed_by(change_of_number(name, factor), wanted)
+    # no valid value, or frozen into a kernel
+    except (InputError, ValueError):
+        return []
 
 
-def find_in_a_copy(words: str) -> None:
-    """Change numbers in a copy of the package, where all that rests on them is made anew."""
-    load_all()
-    known = list(cases())
-    chosen = [
-        name
-        for name in unchecked_numbers()
-        if not words or any(word in name for word in words.split(","))
-    ]
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder)
-        for part in ("hybridvo", "hybridvo_lab", "tools", "configs"):
-            shutil.copytree(ROOT / part, copy / part)
-        (copy / "docs").mkdir()
-        shutil.copy(FROZEN, copy / "docs")
-        shutil.copy(NOTICED, copy / "docs")
-        for name in chosen:
-            likely = likely_to_notice(fitted_numbers()[name][0])
-            wanted = [
-                case for case in known if any(word in case for word in likely)
-            ]
-            found = None
-            for direction, factor in FACTORS.items():
-                case = noticed_in(copy, name, factor, wanted)
-                if case is not None:
-                    found = direction, case
-                    break
-            print(f"{name}: {found or 'not noticed'}", flush=True)
-            if found is not None:
-                keep_noticed(name, found)
+def copied(folder: Path) -> Path:
+    """Copy what the quick golden needs into a folder, with its compiled kernels."""
+    for part in ("hybridvo", "hybridvo_lab", "tools"):
+        shutil.copytree(ROOT / part, folder / part)
+    (folder / "docs").mkdir()
+    for path in (FROZEN, NOTICED):
+        shutil.copy(path, folder / "docs")
+    return folder
 
 
 def noticed_in(
     copy: Path, name: str, factor: float, wanted: Sequence[str]
-) -> str | None:
-    """The first case that notices a number that is changed in the sources of a copy."""
+) -> list[str]:
+    """What some cases find of a number that is changed in the sources of a copy."""
     constant, keys = fitted_numbers()[name]
     path = next(
         path
         for path in sorted(copy.rglob("calibration.py"))
         if re.search(rf"^{constant} = ", path.read_text("utf-8"), re.MULTILINE)
     )
-    before = path.read_text("utf-8")
-    path.write_text(edited(before, constant, keys, factor), "utf-8")
-    command = [
-        sys.executable,
-        "tools/golden.py",
-        "--quick",
-        "--only",
-        ",".join(wanted),
-    ]
-    environment = os.environ | {"PYTHONPATH": str(copy)}
+    path.write_text(
+        edited(path.read_text("utf-8"), constant, keys, factor), "utf-8"
+    )
+    tool = ["tools/golden.py", "--quick", "--only", ",".join(wanted)]
     done = subprocess.run(
-        command,
+        [sys.executable, *tool],
         cwd=copy,
-        env=environment,
+        env=os.environ | {"PYTHONPATH": str(copy)},
         capture_output=True,
         text=True,
         check=False,
     )
-    path.write_text(before, "utf-8")
-    lines = done.stdout.splitlines()
-    if not lines or not lines[-1].startswith("golden:"):
-        # a third more of it is no valid value
-        return None
-    found = [line for line in lines[:-1] if not line.startswith("better")]
-    return found[0].split()[1].rstrip(":") if found else None
+    *found, last = done.stdout.splitlines() or [""]
+    if not last.startswith("golden:"):
+        return []
+    return [line for line in found if not line.startswith("better")]
 
 
 def edited(text: str, constant: str, keys: tuple[Any, ...], factor: float) -> str:
@@ -491,11 +486,12 @@ def edited(text: str, constant: str, keys: tuple[Any, ...], factor: float) -> st
     raise ValueError(constant)
 
 
-def keep_noticed(name: str, found: tuple[str, str]) -> None:
+def keep_noticed(name: str, found: Noticed) -> None:
     """Write down which case notices a number."""
     noticed = json.loads(NOTICED.read_text(encoding="utf-8"))
     noticed[name] = found
-    NOTICED.write_text(f"{json.dumps(noticed, indent=1)}\n", encoding="utf-8")
+    lines = [f" {json.dumps(n)}: {json.dumps(each)}" for n, each in noticed.items()]
+    NOTICED.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
 
 def likely_to_notice(constant: str) -> set[str]:
@@ -567,8 +563,7 @@ def main(argv: list[str] | None = None) -> int:
         print(*unchecked_numbers(), sep="\n")
         return 0
     if args.find:
-        find = find_in_a_copy if args.in_a_copy else find_who_notices
-        find(args.numbers)
+        find_who_notices(args.numbers, args.in_a_copy)
         return 0
     chosen = [
         change_of_number(name, factor)

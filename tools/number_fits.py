@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -207,10 +206,9 @@ def rendered(family: str, rate: str) -> Recording:
 
 def names_of(words: str) -> list[str]:
     """Numbers whose names have one of some words in them; ``ALL``: every number."""
-    changes.ROOMS = ROOMS
     return [
         name
-        for name in changes.fitted_numbers()
+        for name in changes.fitted_numbers(ROOMS)
         if name.split("[")[0] not in FITTED
         and (words == "ALL" or any(word in name for word in words.split(",")))
     ]
@@ -270,14 +268,11 @@ def rows_of_objects(data: Path) -> dict[str, Row]:
 
 def is_of_objects(name: str) -> bool:
     """Whether a number is about what else moves, which changes no pose."""
-    constant = name.split("[")[0]
     from hybridvo.tracking import object_motions
-    from hybridvo.tracking import objects as tracked
+    from hybridvo.tracking import objects as followed
 
-    texts = [
-        Path(module.__file__).read_text() for module in (object_motions, tracked)
-    ]
-    return any(re.search(rf"\b{constant}\b", text) for text in texts)
+    constant = name.split("[")[0]
+    return any(constant in vars(room) for room in (object_motions, followed))
 
 
 @functools.cache
@@ -299,7 +294,6 @@ rows_as_they_are = functools.cache(rows_of)
 def rows_with(data: Path, name: str) -> dict[str, dict[str, Row]]:
     """Rows of each maker with a number as it is, and with others in its place."""
     changes.load_all()
-    changes.ROOMS = ROOMS
     of_objects = is_of_objects(name)
     found = {AS_IT_IS: rows_as_they_are(data, of_objects)}
     constant, keys = changes.fitted_numbers()[name]

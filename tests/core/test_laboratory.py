@@ -46,7 +46,9 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_entry_point_leads_to_something() -> None:
     text = (ROOT / "hybridvo_lab/pyproject.toml").read_text(encoding="utf-8")
-    stated = tomllib.loads(text)["project"]["entry-points"]
+    project = tomllib.loads(text)["project"]
+    assert project["version"] == hvo.__version__
+    stated = project["entry-points"]
     for group, points in stated.items():
         assert set(laboratory.names_of(group)) == set(points)
         for name in points:

@@ -23,7 +23,7 @@ def ids(value: object) -> str:
 
 def cases_that_notice() -> list[str]:
     by_behaviour = mutations.BEHAVIOUR_NOTICED_BY.values()
-    by_number = (case for _, case in mutations.NOTICED_BY.values())
+    by_number = (noticed.case for noticed in mutations.NOTICED_BY.values())
     return sorted({*by_behaviour, *by_number})
 
 
@@ -39,9 +39,8 @@ def test_a_change_of_behaviour_is_noticed(name, case):
 @pytest.mark.long
 @pytest.mark.parametrize("name", mutations.NOTICED_BY, ids=ids)
 def test_a_fitted_number_changed_by_a_third_is_noticed(name):
-    direction, case = mutations.NOTICED_BY[name]
-    change = mutations.change_of_number(name, mutations.FACTORS[direction])
-    assert mutations.noticed_by(change, [case])
+    direction, case, in_a_copy = mutations.NOTICED_BY[name]
+    assert mutations.who_notices(name, direction, [case], in_a_copy)
 
 
 @pytest.mark.long
