@@ -159,7 +159,7 @@ def refine(
     options = Options() if options is None else options
     check_kind("refine.options", options, Options)
     if isinstance(pair, PairBatch):
-        from hybridvo.solver.torch.backend import refine_batch
+        from hybridvo.batches import refine_batch
 
         return refine_batch(
             pair,

@@ -24,11 +24,13 @@ from hybridvo.core.belief import Belief, resized
 from hybridvo.core.errors import InputError, did_you_mean
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
+    Motion,
     MotionPrior,
     Reason,
     RelativePose,
     StageFailed,
     Status,
+    Term,
     identity_covariance,
 )
 from hybridvo.core.stages import stage
@@ -40,7 +42,7 @@ from hybridvo.evidence.one_time import (
 )
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
 from hybridvo.flow.providers import FlowProvider, have_texture, with_flow
-from hybridvo.hypotheses.direct import PRIOR_COVARIANCE, direct_start
+from hybridvo.hypotheses.direct import PRIOR_COVARIANCE, Aligned, align_images
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
@@ -48,9 +50,9 @@ from hybridvo.hypotheses.select import (
     select_by_cues,
     select_from,
 )
-from hybridvo.judge.calibration import DIRECT_PROBABILITY, WITHOUT_IMAGES_RIGHT
-from hybridvo.judge.findings import Question
-from hybridvo.judge.verdict import judge
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.judge.probability import probability_of, surest_evidence
+from hybridvo.judge.verdict import believed, judge
 from hybridvo.network.models import Models, default_models
 from hybridvo.solver import refine_flow as refinement
 from hybridvo.solver.depth_alone import follow_depth
@@ -105,18 +107,11 @@ class Context:
         )
 
 
-class Found(NamedTuple):
-    """A motion, and the frames with the flow on which it was found."""
-
-    motion: RelativePose
-    pair: FramePair
-
-
 # -- the sources ---------------------------------------------------------------------
 
 
 @stage("images alone")
-def by_images(evidence: PairEvidence) -> Found | None:
+def by_images(evidence: PairEvidence) -> Motion | None:
     """The motion by images and depth maps alone, where that is sure; else None."""
     mode = evidence.options.direct.mode
     # flow that is not computed from the same images knows more than they
@@ -128,39 +123,51 @@ def by_images(evidence: PairEvidence) -> Found | None:
     is_near = evidence.near is not None
     if is_near:
         start = evidence.near
-    refine = evidence.options.refine
-    belief = evidence.ready_belief
     pair = evidence.pair
-    found = direct_start(pair, start, DIRECT_PROBABILITY, refine, belief, is_near)
-    if found is None:
+    refine = evidence.options.refine
+    rough = align_images(pair, start, refine, evidence.ready_belief, is_near)
+    motion = sure_alignment(rough, DIRECT_PROBABILITY)
+    if motion is None:
         return None
-    depths = compare_depths(pair, found.T_curr_prev, found.weights)
+    depths = compare_depths(pair, motion.T_curr_prev, motion.weights)
     agree = depths is None or depths.status.ok
-    return Found(found, pair) if agree else None
+    return motion if agree else None
+
+
+def sure_alignment(rough: Aligned | None, least: float) -> Motion | None:
+    """The refined motion of images that were roughly aligned; None where it is less probable."""
+    # rejected early where it would not be right even if it were precise
+    if rough is None or probability_of(surest_evidence(rough).evidence) < least:
+        return None
+    aligned = rough.refined()
+    if aligned is None:
+        return None
+    motion = surest_evidence(aligned)
+    return motion if probability_of(motion.evidence) >= least else None
 
 
 def by_flow(
     evidence: PairEvidence, ctx: Context, solve: Solver | None = None
-) -> Iterator[Found]:
+) -> Iterator[Motion]:
     """The motion by PWVO's look at all motions, in one more flow of the images each time.
 
     Where a flow shows nothing the answer stays; a failure is that of the first flow.
     """
     solve = solve or solve_in_numba
     looks: list[Look] = []
-    failure: Found | None = None
+    failure: Motion | None = None
     for flow in evidence.flows():
         try:
             looks.append(look_at(flow, ctx))
             yield solve(looks, ctx)
         except StageFailed as error:
-            failure = failure or Found(failed(error), flow.pair)
+            failure = failure or failed(error)
             if not looks:
                 yield failure
 
 
 @stage("images alone")
-def by_depth(evidence: PairEvidence) -> Found | None:
+def by_depth(evidence: PairEvidence) -> Motion | None:
     """The motion by depth maps and what is expected of it, where an image shows nothing.
 
     It is degraded: what moves by itself cannot be told by depth from what stands.
@@ -176,20 +183,19 @@ def by_depth(evidence: PairEvidence) -> Found | None:
     if depth is None:
         return None
     text = "an image is dark or covered: the depth maps carry the motion"
-    terms: tuple[str, ...] = ("depth",)
+    terms: tuple[Term, ...] = (Term.DEPTH,)
     if depth.rests_on(expected):
         text = f"{text}, and what was expected where they leave it open"
-        terms = ("depth", "expected")
-    motion = RelativePose(
+        terms = (Term.DEPTH, Term.EXPECTED)
+    return Motion(
         depth.known.T_curr_prev,
         depth.known.covariance,
         Status.degraded(Reason.NO_FLOW, text),
-        inlier_ratio=depth.inlier_ratio,
+        inlier_ratio=depth.evidence.inlier_ratio,
         weights=depth.weights,
-        probability=WITHOUT_IMAGES_RIGHT * depth.in_view * depth.inlier_ratio,
+        evidence=depth.evidence,
         terms=terms,
     )
-    return Found(motion, pair)
 
 
 class Look(NamedTuple):
@@ -200,7 +206,7 @@ class Look(NamedTuple):
     scorer: PWVOScorer
 
 
-Solver = Callable[[Sequence[Look], Context], Found]
+Solver = Callable[[Sequence[Look], Context], Motion]
 """Selects the camera's motion from all looks at a pair so far, and refines it."""
 
 
@@ -225,20 +231,19 @@ def surest_look(looks: Sequence[Look]) -> Look:
 
 
 @stage("solve")
-def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Found:
+def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Motion:
     """Select the camera's motion from all looks, and fit it inside its static mask."""
     chosen = select_from([look.ranking for look in looks])
-    flow = surest_look(looks).flow
-    return Found(fit(flow, chosen, ctx), flow.pair)
+    return fit(surest_look(looks).flow, chosen, ctx)
 
 
 @stage("solve")
-def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
+def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Motion:
     """Select seed and weights from the maps of the surest motion, and refine in torch."""
+    from hybridvo.batches import refine_batch
     from hybridvo.network.pair_maps import maps_of_best, with_patches
     from hybridvo.network.selection import select
     from hybridvo.network.threads import single_threaded_inference
-    from hybridvo.solver.torch.backend import refine_batch
 
     best = surest_look(looks)
     rankings = [look.ranking for look in looks]
@@ -253,32 +258,23 @@ def solve_in_torch(looks: Sequence[Look], ctx: Context) -> Found:
             options=ctx.options.refine,
             min_probability=ctx.options.select.min_probability,
         )
-    return Found(motion.one(0), best.flow.pair)
+    return motion.one(0)
 
 
 @stage("solve")
-def fit(
-    flow: FlowEvidence, chosen: refinement.Selection, ctx: Context
-) -> RelativePose:
-    """A motion fitted to flow and depth inside its mask, with covariance and status."""
-    options = ctx.options
+def fit(flow: FlowEvidence, chosen: refinement.Selection, ctx: Context) -> Motion:
+    """A motion fitted to flow and depth inside its mask, with covariance."""
+    refine = ctx.options.refine
     grid = static_grid(
-        flow.motions, flow.pair, chosen.mask, flow.of.weights, options.refine
+        flow.motions, flow.pair, chosen.mask, flow.of.weights, refine
     )
-    return refinement.refine_pair(
-        flow.pair,
-        chosen,
-        grid,
-        None,
-        options.refine,
-        options.select.min_probability,
-    )
+    return refinement.refine_pair(flow.pair, chosen, grid, options=refine)
 
 
 # -- the methods ---------------------------------------------------------------------
 
 
-def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Found | None]:
+def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Motion | None]:
     """By images and depth alone; then by flow, and at the end on the images again.
 
     Where an image shows nothing there is no flow: then depth is asked.
@@ -291,23 +287,21 @@ def hybrid(evidence: PairEvidence, ctx: Context) -> Iterator[Found | None]:
         yield depth_alone
 
 
-def classical(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+def classical(evidence: PairEvidence, ctx: Context) -> Iterator[Motion]:
     """Search, select by hand-made cues, refine; from a known start refine at once."""
     pair = evidence.with_flow
     if evidence.start is not None:
         check_images(pair)
         known = refinement.Selection(evidence.start)
-        motion = refinement.refine_pair(
-            pair, known, None, evidence.weights, ctx.options.refine
-        )
-        yield Found(motion, pair)
+        refine = ctx.options.refine
+        yield refinement.refine_pair(pair, known, None, evidence.weights, refine)
         return
     flow = next(evidence.flows())
     chosen = select_by_cues(flow.motions, evidence.expected)
-    yield Found(fit(flow, chosen, ctx), pair)
+    yield fit(flow, chosen, ctx)
 
 
-def pwvo_refine(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+def pwvo_refine(evidence: PairEvidence, ctx: Context) -> Iterator[Motion]:
     """The same looks and selection, refined in torch, on its device; then on the images.
 
     The same lines serve batches, with gradients to flow, depth, weights and maps.
@@ -315,21 +309,18 @@ def pwvo_refine(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
     return by_flow(evidence, ctx, solve_in_torch)
 
 
-def pwvo(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+def pwvo(evidence: PairEvidence, ctx: Context) -> Iterator[Motion]:
     """PWVO alone: the hypothesis with the best score, as its pixels repeat it."""
     from hybridvo.network.prediction import estimate_by_pwvo
 
     pair = evidence.with_flow
     network = ctx.models.network("pwvo")
-    motion = estimate_by_pwvo(
-        pair, network, evidence.expected, ctx.options, ctx.seed
-    )
-    yield Found(motion, pair)
+    yield estimate_by_pwvo(pair, network, evidence.expected, ctx.options, ctx.seed)
 
 
-def identity(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+def identity(evidence: PairEvidence, ctx: Context) -> Iterator[Motion]:
     """No motion: the floor that every method must beat."""
-    yield Found(RelativePose(covariance=identity_covariance()), evidence.pair)
+    yield Motion(covariance=identity_covariance())
 
 
 def _nothing_is_missing() -> str:
@@ -361,7 +352,7 @@ class Method:
         missing: returns why it cannot run here, and the remedy; empty where it can.
     """
 
-    answers: Callable[[PairEvidence, Context], Iterator[Found | None]]
+    answers: Callable[[PairEvidence, Context], Iterator[Motion | None]]
     networks: tuple[str, ...] = ()
     on_images: bool = False
     is_verified: bool = True
@@ -405,18 +396,11 @@ def method_of(name: str) -> Method:
 # -- from evidence to an answer ------------------------------------------------------
 
 
-class Answer(NamedTuple):
-    """The motion of one of several pairs."""
-
-    number: int  # of the pair
-    motion: RelativePose
-
-
 def run_method(
     evidence: PairEvidence, method: str, ctx: Context, deadline: float | None = None
 ) -> RelativePose:
     """Return the motion of a pair by a method, see :func:`first_sure`."""
-    return first_sure([evidence], method, ctx, deadline).motion
+    return first_sure([evidence], method, ctx, deadline)[1]
 
 
 def by_first_source(
@@ -449,7 +433,7 @@ def first_sure(
     method: str,
     ctx: Context,
     deadline: float | None = None,
-) -> Answer:
+) -> tuple[int, RelativePose]:
     """Return the first sure motion of pairs that end at the same frame.
 
     Each source is tried on every pair before the next source is tried on any; sparse matches, the
@@ -464,28 +448,29 @@ def first_sure(
             time.
 
     Returns:
-        The first motion that is ok; where none is, the surest, by all sources, of any pair. It has
-        the method's name, and the milliseconds since the call.
+        The number of the pair, and its motion: the first one that is ok; where none is, the surest,
+        by all sources, of any pair. It has the method's name, and the milliseconds since the call.
     """
     started = time.perf_counter()
-
-    def timed(answer: Answer) -> Answer:
-        return answer._replace(motion=_signed(answer.motion, method, started))
-
     pairs = [at_one_time(evidence, method, ctx, deadline) for evidence in pairs]
     rounds = _Rounds(pairs, method, ctx, deadline)
-    for number, found in rounds:
+    for number in rounds:
         late = is_late(deadline)
-        if found.motion.ok or (found.motion.usable and late):
-            answer = Answer(number, finished(pairs[number], found, method, late))
-            if answer.motion.ok or (answer.motion.usable and late):
-                return timed(answer)
+        if _suffices(rounds.believed[number], late):
+            motion = finished(pairs[number], rounds.last[number], method, late)
+            if _suffices(motion, late):
+                return number, _signed(motion, method, started)
     finals = {
         number: finished(pairs[number], found, method, is_late(deadline))
         for number, found in rounds.last.items()
     }
     number = max(finals, key=lambda each: finals[each].rank)
-    return timed(Answer(number, finals[number]))
+    return number, _signed(finals[number], method, started)
+
+
+def _suffices(motion: RelativePose, late: bool) -> bool:
+    """Whether nothing more is tried: the motion is ok, or usable when time is over."""
+    return motion.ok or (motion.usable and late)
 
 
 def at_one_time(
@@ -523,7 +508,8 @@ class _Rounds:
     of the surest motion alone, and not after the deadline.
 
     Attributes:
-        last: the last answer so far about each pair, by its number.
+        last: the last motion so far of each pair, by its number.
+        believed: the same with its probability by what speaks for it.
     """
 
     def __init__(
@@ -533,20 +519,21 @@ class _Rounds:
         ctx: Context,
         deadline: float | None,
     ) -> None:
-        self.last: dict[int, Found] = {}
-        self._pairs = pairs
+        self.last: dict[int, Motion] = {}
+        self.believed: dict[int, RelativePose] = {}
         asked = method_of(method)
         self._answers = [asked.answers(evidence, ctx) for evidence in pairs]
         self._cheap_rounds = asked.cheap_rounds
         self._deadline = deadline
+        self._min_probability = ctx.options.select.min_probability
 
-    def __iter__(self) -> Iterator[tuple[int, Found]]:
-        """Yield each answer with the number of its pair."""
-        numbers = list(range(len(self._pairs)))
+    def __iter__(self) -> Iterator[int]:
+        """Yield the number of a pair whenever a source has found a motion of it."""
+        numbers = list(range(len(self._answers)))
         for done in itertools.count():
             is_costly = done >= self._cheap_rounds
             if done == self._cheap_rounds and numbers:
-                numbers = [max(numbers, key=lambda each: self._motion(each).rank)]
+                numbers = [max(numbers, key=self._rank)]
             if not numbers or (is_costly and is_late(self._deadline)):
                 return
             for number in list(numbers):
@@ -557,16 +544,16 @@ class _Rounds:
                     continue
                 except StageFailed as error:
                     numbers.remove(number)
-                    found = Found(failed(error), self._pairs[number].pair)
+                    found = failed(error)
                 if found is not None:
                     self.last[number] = found
-                    yield number, found
+                    self.believed[number] = believed(found, self._min_probability)
+                    yield number
 
-    def _motion(self, number: int) -> RelativePose:
-        """The last motion of a pair."""
-        if number in self.last:
-            return self.last[number].motion
-        return RelativePose.failed(Reason.NO_FLOW, "no source was asked")
+    def _rank(self, number: int) -> tuple[bool, bool, float]:
+        """How sure the last motion of a pair is."""
+        known = self.believed.get(number)
+        return (False, False, 0.0) if known is None else known.rank
 
 
 def failed(error: StageFailed) -> RelativePose:
@@ -575,46 +562,32 @@ def failed(error: StageFailed) -> RelativePose:
 
 
 def finished(
-    evidence: PairEvidence, found: Found, method: str, late: bool = False
+    evidence: PairEvidence, found: Motion, method: str, late: bool = False
 ) -> RelativePose:
     """Fit a motion to the images where its method does so, and judge it.
 
     Args:
         evidence: of the pair.
-        found: a motion, and the flow on which it was found.
+        found: its motion.
         method: which found it.
         late: whether its time is over: what only improves it is left out.
     """
-    motion = found.motion
-    if method_of(method).on_images and not late:
-        motion = on_images(found, evidence.options)
-    question = Question(
-        evidence.pair,
-        motion,
-        flow_source(evidence, motion),
-        evidence.provider,
-        evidence.options.refine,
-    )
-    return judge(question, is_compared=method_of(method).is_verified)
+    asked = method_of(method)
+    if asked.on_images and not late:
+        found = on_images(evidence, found)
+    return judge(evidence, found, is_compared=asked.is_verified)
 
 
 @stage("solve")
-def on_images(found: Found, options: Options) -> RelativePose:
+def on_images(evidence: PairEvidence, motion: Motion) -> Motion:
     """A motion by flow, refined on the two images where that is wanted and possible."""
-    motion = found.motion
+    options = evidence.options
     # images know no better which of two depths that differ is right
     contradicted = motion.status.reason is Reason.NO_VALID_DEPTH
-    is_off = options.photometric.mode == "off" or "flow" not in motion.terms
+    is_off = options.photometric.mode == "off" or Term.FLOW not in motion.terms
     if is_off or contradicted:
         return motion
-    return refine_photometric(found.pair, motion, options=options.refine)
-
-
-def flow_source(evidence: PairEvidence, motion: RelativePose) -> str:
-    """What an answer's flow comes from; ``dis`` where that is its images themselves."""
-    if "flow" not in motion.terms and "images" in motion.terms:
-        return "dis"
-    return evidence.flow_source or "callable"
+    return refine_photometric(evidence.pair, motion, options=options.refine)
 
 
 def is_late(deadline: float | None) -> bool:

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from hybridvo.core.results import RelativePose
+from hybridvo.core.results import Motion
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.pipeline import Context, Found, Method, method_names
+from hybridvo.pipeline import Context, Method, method_names
 from hybridvo_lab import baselines
 
 SELECTION = {
@@ -31,24 +31,23 @@ def in_order() -> tuple[str, ...]:
 
 def network_alone(
     name: str, evidence: PairEvidence, ctx: Context
-) -> Iterator[Found]:
+) -> Iterator[Motion]:
     """A network of the paper alone, by the paper's selection."""
     from hybridvo_lab.paper.prediction import estimate_by_network
 
     pair = evidence.with_flow
     network = ctx.models.network(name)
-    yield Found(estimate_by_network(pair, SELECTION[name], network), pair)
+    yield estimate_by_network(pair, SELECTION[name], network)
 
 
-def baseline(name: str, evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+def baseline(name: str, evidence: PairEvidence, ctx: Context) -> Iterator[Motion]:
     """An estimator of another library, from the expected motion where it takes a start."""
     needs_flow = name not in baselines.WITHOUT_FLOW
     pair = evidence.with_flow if needs_flow else evidence.pair
     start = evidence.start
     if start is None and evidence.expected is not None:
         start = evidence.expected.T_curr_prev
-    motion: RelativePose = baselines.estimate(name, pair, ctx.seed, start=start)
-    yield Found(motion, pair)
+    yield baselines.estimate(name, pair, ctx.seed, start=start)
 
 
 def _row_of_paper(name: str) -> Method:

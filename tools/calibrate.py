@@ -36,22 +36,23 @@ from scipy.special import expit, logsumexp
 
 from hybridvo import Odometry, dis_flow, iter_pairs, open_sequence, refine
 from hybridvo.core.belief import Belief
-from hybridvo.core.calibration import CERTAINTY_BONUS, MIN_PROBABILITY
+from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import invert, pose_matrix
 from hybridvo.core.results import StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.providers import with_flow
 from hybridvo.hypotheses.cues import Cues, compute_cues
-from hybridvo.hypotheses.direct import direct_start
+from hybridvo.hypotheses.direct import align_images
+from hybridvo.hypotheses.direct_evidence import RememberedEvidence
 from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
 )
 from hybridvo.io.data.truth import true_motion
-from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.judge.calibration import CERTAINTY_BONUS, DIRECT_PROBABILITY
 from hybridvo.network.models import Models
-from hybridvo.pipeline import Context, by_flow, run_method
+from hybridvo.pipeline import Context, by_flow, run_method, sure_alignment
 from hybridvo.tracking.memory import carried_to
 from hybridvo_lab.calibration import WRONG_PX
 from hybridvo_lab.synthetic.noise_scenarios import SCENARIOS, make_pair
@@ -286,7 +287,7 @@ def direct_answers(case: Case) -> Iterator[Answer]:
     if motions is not None:
         starts += [pose_matrix(pose) for pose in motions.poses[-2:]]
     for start in starts:
-        direct = direct_start(case.pair, start, min_probability=0.0)
+        direct = sure_alignment(align_images(case.pair, start), 0.0)
         if direct is not None:
             error_px = case.error_px(direct.T_curr_prev)
             yield Answer(DIRECT, (*direct.evidence, NO_BELIEF), error_px)
@@ -321,14 +322,14 @@ def remembered_answer(
     case: Case, T_near: np.ndarray, belief: Belief
 ) -> Answer | None:
     """The direct motion from one that is near; None where images and depth maps do not match."""
-    direct = direct_start(case.pair, T_near, 0.0, belief=belief, is_near=True)
+    rough = align_images(case.pair, T_near, belief=belief, is_near=True)
+    direct = sure_alignment(rough, 0.0)
     if direct is None:
         return None
-    certainty = NO_BELIEF
-    if "memory" in direct.terms:
-        certainty = belief.certainty
-    error_px = case.error_px(direct.T_curr_prev)
-    return Answer(DIRECT, (*direct.evidence, certainty), error_px)
+    evidence = direct.evidence
+    if not isinstance(evidence, RememberedEvidence):
+        evidence = (*evidence, NO_BELIEF)
+    return Answer(DIRECT, evidence, case.error_px(direct.T_curr_prev))
 
 
 def sparse(depth: np.ndarray) -> np.ndarray:
@@ -347,8 +348,7 @@ def answers(case: Case, models: Models) -> Iterator[Answer]:
         return
     yield from cue_answers(case)
     # after each source: what is stated then must be right then
-    for found in by_flow(evidence, ctx):
-        motion = found.motion
+    for motion in by_flow(evidence, ctx):
         if motion.usable:
             yield Answer(CHOICE, motion.evidence, case.error_px(motion.T_curr_prev))
 
@@ -499,7 +499,7 @@ def fit_direct(
     """Weights of the two probabilities whose product is that of a direct motion.
 
     Args:
-        evidence: (N, k), see :class:`hybridvo.judge.choice.DirectEvidence`.
+        evidence: (N, k), see :class:`hybridvo.hypotheses.direct_evidence.DirectEvidence`.
         certainty: (N,) log odds of the belief that was asked, NO_BELIEF where none was.
         right: (N,) bool.
         counts: (N,) by how much each answer counts.

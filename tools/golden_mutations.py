@@ -153,10 +153,8 @@ def answers_changed(change: Callable[[Any], Any]) -> Iterator[None]:
     from hybridvo.pipeline import first_sure
 
     def changed(*args: Any, **options: Any) -> Any:
-        answer = first_sure(*args, **options)
-        if not answer.motion.usable:
-            return answer
-        return answer._replace(motion=change(answer.motion))
+        number, motion = first_sure(*args, **options)
+        return number, change(motion) if motion.usable else motion
 
     with everywhere("first_sure", first_sure, changed):
         yield

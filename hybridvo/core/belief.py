@@ -11,7 +11,6 @@ from scipy.special import expit
 from hybridvo.core.calibration import (
     BELIEF_MIDDLE,
     BELIEF_SLOPE,
-    CERTAINTY_BONUS,
     KNOWN_LOG_ODDS,
     MIN_CERTAINTY,
     MIN_MOVING,
@@ -75,14 +74,6 @@ class Belief:
         """(h, w) float32 factors on the texture of each point, from 0 to 1."""
         ramp = self.log_odds.astype(np.float32) - TEXTURE_MIDDLE
         return np.asarray(expit(ramp), np.float32)
-
-    def probability_of(self, probability: float) -> float:
-        """The probability of a motion of which the static part is known.
-
-        Args:
-            probability: by what lies in the static part alone.
-        """
-        return float(probability * expit(self.certainty + CERTAINTY_BONUS))
 
 
 def grid_index(shape: tuple[int, int], points: int = POINTS) -> np.ndarray:

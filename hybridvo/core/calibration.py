@@ -34,7 +34,3 @@ BELIEF_SLOPE = 2.0
 """How fast that weight rises, 1 / nat."""
 TEXTURE_MIDDLE = 1.0
 """Log odds to be static at which half of a point's texture counts."""
-CERTAINTY_BONUS = 2.0
-"""Nats that are added to the certainty of a belief where a motion of what it holds static is
-judged: films say 10 (``tools/calibrate.py --direct``), but in none of them is a whole belief wrong
-from the start."""

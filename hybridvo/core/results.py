@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import scipy
 
 from hybridvo.core.checks import as_rigid, to_numpy
 from hybridvo.core.errors import InputError
@@ -233,8 +231,77 @@ class PhotometricReport:
     agreement: float = 1.0
 
 
+class Term(enum.StrEnum):
+    """What a motion is based on."""
+
+    FLOW = "flow"
+    IMAGES = "images"
+    # of the current frame
+    DEPTH = "depth"
+    GYROSCOPE = "gyroscope"
+    # only what is believed to be static confirms it
+    MEMORY = "memory"
+    # what was expected decides a direction that depth leaves open
+    EXPECTED = "expected"
+
+
 @dataclass(frozen=True, eq=False)
-class RelativePose:
+class Motion:
+    """A camera motion that a source found in a pair, and what speaks for it.
+
+    The judge makes a :class:`RelativePose` of it, which has the same attributes, and states how
+    probable it is; the status is here that of the source alone.
+    """
+
+    T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
+    covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
+    status: Status = field(default_factory=Status)
+    inlier_ratio: float = 0.0
+    iterations: int = 0
+    cost: float = 0.0
+    residual_scale_px: float = 0.0
+    depth_noise: float = 0.0
+    weights: np.ndarray | None = None
+    evidence: tuple[float, ...] = ()
+    hypotheses: tuple[Hypothesis, ...] = ()
+    terms: tuple[Term, ...] = ()
+    photometric: PhotometricReport | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the motion is neither degraded nor failed."""
+        return self.status.ok
+
+    @property
+    def usable(self) -> bool:
+        """Whether the motion may be used. A degraded one has a wider covariance."""
+        return self.status.usable
+
+    @property
+    def is_by_depth_alone(self) -> bool:
+        """Whether neither images nor flow took part in a motion that was found."""
+        found_by = {Term.IMAGES, Term.FLOW} & set(self.terms)
+        return self.usable and Term.DEPTH in self.terms and not found_by
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """The inverse (4, 4), as expected by the "between" factors of pose graphs."""
+        return invert(self.T_curr_prev)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed.
+
+        Args:
+            changes: new values by field name.
+
+        Returns:
+            The copy.
+        """
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose(Motion):
     """The camera motion of a pair; the identity if the estimate failed.
 
     Attributes:
@@ -252,17 +319,16 @@ class RelativePose:
             variance, px.
         depth_noise: standard deviation of log depth at such a pixel.
         weights: (H, W) float32 robust weight of each pixel, or None.
+        evidence: the numbers from which the probability is computed, if any. Their type says
+            what they are, see :mod:`hybridvo.judge.probability`.
+        hypotheses: every strong motion that was found, the selected one first.
+        terms: what the motion is based on.
+        photometric: what the photometric refinement did; None if it was not tried.
         probability: probability that this is the camera's motion rather than an
             object's; 0 if the estimate failed, NaN if a batch had no weights to
             compute it from.
-        evidence: the numbers from which the probability was computed, if any.
-        hypotheses: every strong motion that was found, the selected one first.
         method: name of the method.
         ms: time spent, milliseconds.
-        terms: what the motion is based on: flow, depth (of the current frame), images,
-            gyroscope; memory if only what is believed to be static confirms it; expected
-            where what was expected decides a direction that depth leaves open.
-        photometric: what the photometric refinement did; None if it was not tried.
 
     >>> ahead = np.eye(4)
     >>> ahead[2, 3] = -0.1  # the camera moved 10 cm forward, so points came closer
@@ -271,48 +337,14 @@ class RelativePose:
     (True, 0.1)
     """
 
-    T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))
-    covariance: np.ndarray = field(default_factory=lambda: np.eye(6))
-    status: Status = field(default_factory=Status)
-    inlier_ratio: float = 0.0
-    iterations: int = 0
-    cost: float = 0.0
-    residual_scale_px: float = 0.0
-    depth_noise: float = 0.0
-    weights: np.ndarray | None = None
     probability: float = 1.0
-    evidence: tuple[float, ...] = ()
-    hypotheses: tuple[Hypothesis, ...] = ()
     method: str = ""
     ms: float = 0.0
-    terms: tuple[str, ...] = ()
-    photometric: PhotometricReport | None = None
-
-    @property
-    def ok(self) -> bool:
-        """Whether the motion is neither degraded nor failed."""
-        return self.status.ok
-
-    @property
-    def usable(self) -> bool:
-        """Whether the motion may be used. A degraded one has a wider covariance."""
-        return self.status.usable
-
-    @property
-    def is_by_depth_alone(self) -> bool:
-        """Whether neither images nor flow took part in a motion that was found."""
-        found_by = {"images", "flow"} & set(self.terms)
-        return self.usable and "depth" in self.terms and not found_by
 
     @property
     def rank(self) -> tuple[bool, bool, float]:
         """A sort key that is larger for a more certain motion."""
         return self.ok, self.usable, self.probability
-
-    @property
-    def T_prev_curr(self) -> np.ndarray:
-        """The inverse (4, 4), as expected by the "between" factors of pose graphs."""
-        return invert(self.T_curr_prev)
 
     @classmethod
     def failed(
@@ -336,17 +368,6 @@ class RelativePose:
             probability=0.0,
             **extra,
         )
-
-    def replace(self, **changes: Any) -> RelativePose:
-        """Return a copy with some fields changed.
-
-        Args:
-            changes: new values by field name.
-
-        Returns:
-            The copy.
-        """
-        return replace(self, **changes)
 
     def __repr__(self) -> str:
         std_m, std_rad = stated_stds(self.covariance)
@@ -541,8 +562,8 @@ class PixelwisePrediction:
         log_scale: (B, 6, h, w) s = log U, where U is the Laplace scale; None for
             networks without uncertainty.
         image_size: (H, W) of the pairs passed to the network.
-        lead: (B,) log odds that the hypothesis is the camera's motion, given all that the
-            network saw of it and of its rivals.
+        evidence: (B, 4) what speaks for the hypothesis among its rivals, a
+            :class:`~hybridvo.hypotheses.select.ChoiceEvidence` each; NaN where there is none.
         patches: the pose of every patch, estimated from its own pixels, as
             :class:`~hybridvo.solver.torch.patches.PatchPoses`; only from PWVO with the extra
             ``train``, otherwise None.
@@ -551,7 +572,7 @@ class PixelwisePrediction:
     motion: torch.Tensor
     log_scale: torch.Tensor | None = None
     image_size: tuple[int, int] | None = None
-    lead: torch.Tensor | None = None
+    evidence: torch.Tensor | None = None
     patches: Any = None
 
     @property
@@ -563,20 +584,6 @@ class PixelwisePrediction:
     def translation(self) -> torch.Tensor:
         """The translations, (B, 3, h, w), metres."""
         return self.motion[:, 3:]
-
-
-def probability_right(evidence: Sequence[float], weights: Sequence[float]) -> float:
-    """Return the probability that a motion is right, a logistic function of its evidence.
-
-    Args:
-        evidence: (n,) numbers.
-        weights: (n + 1,) a weight for each number, then a constant.
-
-    >>> probability_right([2.0], [0.5, -1.0])
-    0.5
-    """
-    log_odds = np.dot(weights, (*evidence, 1.0))
-    return float(scipy.special.expit(log_odds))
 
 
 def identity_covariance() -> np.ndarray:

@@ -78,10 +78,3 @@ MEMORY_SURE = 0.995
 """Probability that the memory is right, which bounds its evidence."""
 
 # Images alone
-
-DIRECT_INFLATION = 3.0
-"""Factor on the covariance of a motion by images and depth maps alone. The squared error of its
-edges in units of the covariance should be 5.3 in the median. Without the factor it is 8.5 on six
-tripods and 19.3 on TartanAir: the tripods alone ask for 1.6, TartanAir alone for 3.6. On four
-rendered walks, whose noise is milder than a sensor's, it is 1.9 (``tools/benchmark.py sigmas``
-shows a change)."""

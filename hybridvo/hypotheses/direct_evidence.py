@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from hybridvo.core.geometry import projection_rows, transform_points
-from hybridvo.core.results import RelativePose
+from hybridvo.core.results import Motion
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred, gradient_at
 from hybridvo.solver.calibration import (
@@ -40,17 +40,81 @@ REGION_SIDE = 5
 # guards divisions where no point is inside the image
 TINY = 1e-6
 
+# What is added to the standard deviation of the ego flow and to its length, fractions of the
+# image's width, to a shift of regions, standard errors, and to a fraction of the texture, before
+# a logarithm is taken.
+LEAST_STD = 1e-5
+LEAST_FLOW = 0.0125
+LEAST_REGION_SHIFT = 0.3
+LEAST_UNEXPLAINED = 0.01
 
-class PointResiduals(NamedTuple):
-    """What the two images show of moved points (N,)."""
 
+class DirectEvidence(NamedTuple):
+    """What speaks for a motion that was found without flow.
+
+    Attributes:
+        log_std: log of the standard deviation of the ego flow, fraction of the image's width.
+        log_flow: log of the mean length of the ego flow, fraction of the image's width.
+        log_region_shift: log of the shift of the image's regions beside the motion, in standard
+            errors.
+        log_unexplained: log of the fraction of the texture in regions that it leaves unexplained.
+    """
+
+    log_std: float
+    log_flow: float
+    log_region_shift: float
+    log_unexplained: float
+
+
+class RememberedEvidence(NamedTuple):
+    """The same of what is believed static alone.
+
+    Attributes:
+        log_std: see :class:`DirectEvidence`.
+        log_flow: likewise.
+        log_region_shift: likewise.
+        log_unexplained: likewise.
+        certainty: log odds that the belief is right.
+    """
+
+    log_std: float
+    log_flow: float
+    log_region_shift: float
+    log_unexplained: float
+    certainty: float
+
+
+def direct_evidence(
+    std: float, flow: float, region_shift: float, unexplained: float
+) -> DirectEvidence:
+    """Collect the evidence on a motion that was found without flow.
+
+    Args:
+        std: standard deviation of the ego flow, fraction of the image's width.
+        flow: mean length of the ego flow, fraction of the image's width.
+        region_shift: shift of the image's regions beside the motion, in standard errors.
+        unexplained: fraction of the texture in regions that it leaves unexplained.
+    """
+    return DirectEvidence(
+        log_std=float(np.log(std + LEAST_STD)),
+        log_flow=float(np.log(flow + LEAST_FLOW)),
+        log_region_shift=float(np.log(region_shift + LEAST_REGION_SHIFT)),
+        log_unexplained=float(np.log(unexplained + LEAST_UNEXPLAINED)),
+    )
+
+
+class SeenPoints(NamedTuple):
+    """What the two images show of the points (N,) of the depth maps, moved along a motion."""
+
+    planes: PlaneFactor
+    follows: np.ndarray  # bool: whether grey value and depth are as they would be
     inside: np.ndarray  # bool: visible inside the current image
     flow_px: np.ndarray  # how far the motion moves them in the image
     # grey levels between the two images, under the motion's gain
     difference: np.ndarray
-    # the same, less the change of brightness around the point
-    residual: np.ndarray
     gradient: np.ndarray  # (2, N) of the previous image, grey levels a pixel
+    width: int  # of the image, px
+    is_exact: bool  # whether the motion counts as exact
 
     @property
     def squared_gradient(self) -> np.ndarray:
@@ -62,20 +126,102 @@ class PointResiduals(NamedTuple):
         """Mean length of the ego flow inside the image."""
         return float(self.flow_px[self.inside].mean()) if self.inside.any() else 0.0
 
+    def evidence(
+        self, std_px: float, static: np.ndarray | float = 1.0
+    ) -> DirectEvidence:
+        """What speaks for the motion.
 
-def compare_points(
+        Args:
+            std_px: standard deviation of the ego flow, px.
+            static: (N,) probability of each point to be static, by which it counts.
+        """
+        shift = 0.0 if self.is_exact else self.shift_of_regions(static)
+        unexplained = self.unexplained_texture(static)
+        return direct_evidence(
+            std_px / self.width, self.mean_flow_px / self.width, shift, unexplained
+        )
+
+    def unexplained_texture(self, static: np.ndarray | float = 1.0) -> float:
+        """Return the fraction of the texture in regions of which most does not follow the motion.
+
+        Args:
+            static: (N,) probability of each point to be static, by which its texture counts.
+        """
+        gradient2 = self.squared_gradient
+        texture = static * gradient2 / (gradient2 + FLAT_GRADIENT**2)
+        texture = np.where(self.inside, texture, 0.0)
+        not_following = _around(self.planes, texture * ~self.follows, REGION_SIDE)
+        all_around = _around(self.planes, texture, REGION_SIDE)
+        unexplained = not_following > 0.5 * all_around
+        return float(texture[unexplained].sum() / np.maximum(texture.sum(), TINY))
+
+    def shift_of_regions(self, static: np.ndarray | float = 1.0) -> float:
+        """Return how far the regions of the image lie beside the motion, in standard errors.
+
+        Each region is shifted so that the two images fit best there, whatever its brightness. Of
+        a right motion most regions stay within what the noise of the images allows.
+
+        Args:
+            static: (N,) probability of each point to be static, by which its texture counts.
+
+        Returns:
+            The median over the texture, per axis of the image; 0 where there is none.
+        """
+        inside = self.inside
+        if not inside.any():
+            return 0.0
+        noise = MAD_TO_STD * float(np.median(np.abs(self.difference[inside])))
+        noise = max(noise, NOISE_GREY)
+        weights = inside / (1 + (self.difference / (REGION_CUTOFF * noise)) ** 2)
+        pixels = [*self.gradient, self.difference]
+        counted = _summed(self.planes, weights)
+        means = [_summed(self.planes, weights * each) for each in pixels]
+        seen = np.maximum(counted, TINY)
+
+        def product(i: int, j: int) -> np.ndarray:
+            """Sums over regions of two of x and y gradient and difference, less their means."""
+            both = _summed(self.planes, weights * pixels[i] * pixels[j])
+            return both - means[i] * means[j] / seen
+
+        # of a shift that is 0 by what is known without the region
+        prior = (noise / MAX_REGION_SHIFT_PX) ** 2
+        xx = product(0, 0)
+        yy = product(1, 1)
+        xy = product(0, 1)
+        bx = product(0, 2)
+        by = product(1, 2)
+        determinant = (xx + prior) * (yy + prior) - xy * xy
+        adjugate = (
+            (yy + prior) * bx * bx - 2 * xy * bx * by + (xx + prior) * by * by
+        )
+        # by how much the best shift lowers the squared differences: its own square in standard
+        # errors, times that of the noise
+        lowered = np.maximum(adjugate, 0) / np.maximum(determinant, TINY)
+        shift = np.sqrt(lowered / 2) / noise
+        is_seen = counted > MIN_SEEN_OF_REGION * REGION_SIDE**2
+        texture = (xx + yy) / (xx + yy + SHOWN_SHIFT * prior)
+        return weighted_median(shift, static * inside * is_seen * texture)
+
+
+def see_points(
     pair: FramePair,
     planes: PlaneFactor,
     at: PlanesAt,
-    motion: RelativePose,
-) -> PointResiduals:
-    """Return the differences of the images at the points of the depth maps, at a motion.
+    motion: Motion,
+    cutoff: float,
+    is_exact: bool = False,
+) -> SeenPoints:
+    """Return what the images show of the points of the depth maps, at a motion.
+
+    A point follows it where its grey value and its depth are as they would be.
 
     Args:
         pair: two frames with images.
         planes: the points.
         at: the depth maps at the motion.
         motion: with the gain of the images.
+        cutoff: of the robust kernel, standard deviations.
+        is_exact: whether the motion counts as exact.
     """
     assert motion.photometric is not None
     height, width = pair.prev.camera.shape
@@ -90,102 +236,22 @@ def compare_points(
     # brightness may change over the image
     change = _around(planes, np.where(inside, difference, 0), LIGHT_SIDE)
     covered = _around(planes, inside, LIGHT_SIDE)
-    return PointResiduals(
+    residual = difference - change / np.maximum(covered, TINY)
+    gradient = gradient_at(grey_prev, v, u)
+    shift_variance = NOISE_SHIFT_PX**2 * np.sum(gradient**2, axis=0)
+    limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
+    by_grey = limit2 / (limit2 + residual * residual)
+    by_depth = np.where(at.surface_depth > 0, at.rows[PlaneRow.ROBUST], 1.0)
+    return SeenPoints(
+        planes=planes,
+        follows=np.asarray(inside & (by_grey * by_depth > MIN_FOLLOWING)),
         inside=inside,
         flow_px=np.hypot(x - u, y - v),
         difference=difference,
-        residual=difference - change / np.maximum(covered, TINY),
-        gradient=gradient_at(grey_prev, v, u),
+        gradient=gradient,
+        width=width,
+        is_exact=is_exact,
     )
-
-
-def following(images: PointResiduals, at: PlanesAt, cutoff: float) -> np.ndarray:
-    """Return (N,) whether the grey value and the depth of a point follow the motion.
-
-    Args:
-        images: at the motion.
-        at: the depth maps at the motion.
-        cutoff: of the robust kernel, standard deviations.
-    """
-    shift_variance = NOISE_SHIFT_PX**2 * images.squared_gradient
-    limit2 = cutoff**2 * (NOISE_GREY**2 + shift_variance)
-    residual = images.residual
-    by_grey = limit2 / (limit2 + residual * residual)
-    by_depth = np.where(at.surface_depth > 0, at.rows[PlaneRow.ROBUST], 1.0)
-    return np.asarray(images.inside & (by_grey * by_depth > MIN_FOLLOWING))
-
-
-def unexplained_texture(
-    images: PointResiduals,
-    follows: np.ndarray,
-    planes: PlaneFactor,
-    static: np.ndarray | float = 1.0,
-) -> float:
-    """Return the fraction of the texture in regions of which most does not follow the motion.
-
-    Args:
-        images: at the motion.
-        follows: (N,) bool, see :func:`following`.
-        planes: the points.
-        static: (N,) probability of each point to be static, by which its texture counts.
-    """
-    gradient2 = images.squared_gradient
-    texture = static * gradient2 / (gradient2 + FLAT_GRADIENT**2)
-    texture = np.where(images.inside, texture, 0.0)
-    not_following = _around(planes, texture * ~follows, REGION_SIDE)
-    all_around = _around(planes, texture, REGION_SIDE)
-    unexplained = not_following > 0.5 * all_around
-    return float(texture[unexplained].sum() / np.maximum(texture.sum(), TINY))
-
-
-def shift_of_regions(
-    images: PointResiduals, planes: PlaneFactor, static: np.ndarray | float = 1.0
-) -> float:
-    """Return how far the regions of the image lie beside the motion, in standard errors.
-
-    Each region is shifted so that the two images fit best there, whatever its brightness. Of a
-    right motion most regions stay within what the noise of the images allows.
-
-    Args:
-        images: at the motion.
-        planes: the points.
-        static: (N,) probability of each point to be static, by which its texture counts.
-
-    Returns:
-        The median over the texture, per axis of the image; 0 where there is none.
-    """
-    inside = images.inside
-    if not inside.any():
-        return 0.0
-    noise = MAD_TO_STD * float(np.median(np.abs(images.difference[inside])))
-    noise = max(noise, NOISE_GREY)
-    weights = inside / (1 + (images.difference / (REGION_CUTOFF * noise)) ** 2)
-    pixels = [*images.gradient, images.difference]
-    counted = _summed(planes, weights)
-    means = [_summed(planes, weights * each) for each in pixels]
-    seen = np.maximum(counted, TINY)
-
-    def product(i: int, j: int) -> np.ndarray:
-        """Sums over regions of two of x and y gradient and difference, less their means."""
-        both = _summed(planes, weights * pixels[i] * pixels[j])
-        return both - means[i] * means[j] / seen
-
-    # of a shift that is 0 by what is known without the region
-    prior = (noise / MAX_REGION_SHIFT_PX) ** 2
-    xx = product(0, 0)
-    yy = product(1, 1)
-    xy = product(0, 1)
-    bx = product(0, 2)
-    by = product(1, 2)
-    determinant = (xx + prior) * (yy + prior) - xy * xy
-    adjugate = (yy + prior) * bx * bx - 2 * xy * bx * by + (xx + prior) * by * by
-    # by how much the best shift lowers the squared differences: its own square in standard
-    # errors, times that of the noise
-    lowered = np.maximum(adjugate, 0) / np.maximum(determinant, TINY)
-    shift = np.sqrt(lowered / 2) / noise
-    is_seen = counted > MIN_SEEN_OF_REGION * REGION_SIDE**2
-    texture = (xx + yy) / (xx + yy + SHOWN_SHIFT * prior)
-    return weighted_median(shift, static * inside * is_seen * texture)
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
@@ -207,9 +273,7 @@ def _summed(planes: PlaneFactor, values: np.ndarray) -> np.ndarray:
     return REGION_SIDE**2 * _around(planes, values, REGION_SIDE)
 
 
-def ego_flow_std(
-    pair: FramePair, points: np.ndarray, motion: RelativePose
-) -> float:
+def ego_flow_std(pair: FramePair, points: np.ndarray, motion: Motion) -> float:
     """Return the standard deviation of the ego flow of points (N, 3), px, by a covariance."""
     moved = transform_points(motion.T_curr_prev, points)
     J = np.concatenate(projection_rows(moved, pair.curr.camera))

@@ -57,7 +57,7 @@ def generate(
         lacks_sky=below_sky.prev is not pair.prev,
         is_complete=(
             len(motions) == 1
-            and motions[0].stats.inlier_ratio >= options.search.unambiguous_ratio
+            and motions[0].inlier_ratio >= options.search.unambiguous_ratio
         ),
     )
 

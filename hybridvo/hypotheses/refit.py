@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.hypotheses.calibration import MASK_RAMP_END, MASK_RAMP_START
-from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
+from hybridvo.hypotheses.types import Candidate, MotionSource
 from hybridvo.solver import kernels
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.robust_fit import fit_coarse
@@ -40,7 +40,7 @@ def fit_in_mask(
     K: np.ndarray,
     pose: np.ndarray,
     cutoff: float,
-) -> Motion:
+) -> Candidate:
     """Fit a motion to the pixels that a mask leaves.
 
     Args:
@@ -58,11 +58,11 @@ def fit_in_mask(
     fitted, (flow_noise_px, depth_noise), inlier_ratio, iterations = fit_coarse(
         masked, mask.size, K, pose, cutoff
     )
-    stats = HypothesisStats(
+    return Candidate(
+        fitted,
         inlier_ratio=float(inlier_ratio),
         flow_noise_px=float(flow_noise_px),
         depth_noise=float(depth_noise),
         source=MotionSource.REFIT,
         iterations=int(iterations),
     )
-    return Motion(fitted, stats)

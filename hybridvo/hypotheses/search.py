@@ -7,8 +7,7 @@ removed before the next round.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +29,7 @@ from hybridvo.hypotheses.proposals import (
     fit_windows,
     score_poses,
 )
-from hybridvo.hypotheses.types import HypothesisStats, Motion, MotionSource
+from hybridvo.hypotheses.types import Candidate, MotionSource
 from hybridvo.solver import kernels, robust_fit
 from hybridvo.solver.kernels import FASTMATH, XN, YN, W, Z
 from hybridvo.solver.pixels import PixelGrid
@@ -65,11 +64,8 @@ REFERENCE_WIDTH = 1024
 COMPARED_STRIDE = 7
 
 
-class Candidates(NamedTuple):
-    """Poses (N, 3, 4) of one kind, which compete in a round."""
-
-    poses: np.ndarray
-    source: MotionSource
+Proposals = Mapping[MotionSource, np.ndarray]
+"""Poses (N, 3, 4) of each kind, which compete in a round."""
 
 
 class _ScoredCandidate(NamedTuple):
@@ -83,7 +79,7 @@ class _ScoredCandidate(NamedTuple):
 
 def find_motions(
     grid: PixelGrid, starts: np.ndarray, options: Options, seed: int
-) -> tuple[Motion, ...]:
+) -> tuple[Candidate, ...]:
     """Find all strong motions of a pair.
 
     Windows and minimal samples compete in every round, the starts only in the first one.
@@ -103,21 +99,21 @@ def find_motions(
     """
     limits = options.search
     search = _Search(grid, options, seed)
-    start_candidates = search.fit_starts(starts)
-    motions: list[Motion] = []
+    fitted = search.fit_starts(starts)
+    motions: list[Candidate] = []
     while (
         len(motions) < limits.max_hypotheses
         and search.remaining_ratio > limits.min_inlier_ratio
     ):
         if not motions:
-            pixel_candidates = search.fit_pixels(FIRST_MINIMAL_SAMPLES)
-            ranked = search.run_round(start_candidates + pixel_candidates)
+            from_pixels = search.fit_pixels(FIRST_MINIMAL_SAMPLES)
+            ranked = search.run_round({MotionSource.START: fitted, **from_pixels})
         else:
             ranked = search.run_round(search.fit_pixels(LATER_MINIMAL_SAMPLES))
         if not ranked:
             break
         winner = ranked[0]
-        if motions and winner.stats.inlier_ratio < limits.min_inlier_ratio:
+        if motions and winner.inlier_ratio < limits.min_inlier_ratio:
             break
         motions.append(winner)
         search.remove_inliers(winner)
@@ -126,21 +122,20 @@ def find_motions(
 
 def _with_runners_up(
     grid: PixelGrid,
-    winners: Sequence[Motion],
-    ranked: Sequence[Motion],
+    winners: Sequence[Candidate],
+    ranked: Sequence[Candidate],
     limits: SearchOptions,
-) -> tuple[Motion, ...]:
+) -> tuple[Candidate, ...]:
     """Append the strong motions that differ from all before, the strongest first."""
     motions = list(winners)
     if not motions:
         return ()
-    by_strength = sorted(ranked, key=lambda x: x.stats.inlier_ratio, reverse=True)
+    by_strength = sorted(ranked, key=lambda x: x.inlier_ratio, reverse=True)
     for motion in by_strength:
-        is_strong = motion.stats.inlier_ratio >= limits.min_inlier_ratio
+        is_strong = motion.inlier_ratio >= limits.min_inlier_ratio
         has_room = len(motions) < limits.max_hypotheses
         if has_room and is_strong and is_new(grid, motion.pose, motions):
-            stats = replace(motion.stats, source=MotionSource.RUNNER_UP)
-            motions.append(Motion(motion.pose, stats))
+            motions.append(motion._replace(source=MotionSource.RUNNER_UP))
     return tuple(motions)
 
 
@@ -160,16 +155,19 @@ class _Search:
         self.n = self.h * self.w
         self.inverse_depth = robust_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
-        self.ranked: list[Motion] = []
+        self.ranked: list[Candidate] = []
         self.remaining_ratio = 1.0
 
-    def fit_starts(self, starts: np.ndarray) -> list[Candidates]:
+    def fit_starts(self, starts: np.ndarray) -> np.ndarray:
         """Fit the poses that the caller hands in, (S, 3, 4), to all pixels.
 
         The first one is the identity. The others are fitted twice, with a wide kernel and
         with a narrow one.
+
+        Returns:
+            (N, 3, 4) poses.
         """
-        candidates = []
+        poses = []
         for number, start in enumerate(starts):
             residual_px = robust_fit.residual_scale(
                 self.samples, self.n, start, self.K
@@ -181,30 +179,27 @@ class _Search:
             for start_px in start_scales:
                 pose = start.copy()
                 self._anneal(CANDIDATE_ANNEALING._replace(start_px=start_px), pose)
-                candidates.append(Candidates(pose[None], MotionSource.START))
-        return candidates
+                poses.append(pose)
+        return np.stack(poses)
 
-    def fit_pixels(self, minimal_samples: int) -> list[Candidates]:
+    def fit_pixels(self, minimal_samples: int) -> Proposals:
         """Fit windows, and so many minimal samples, to the pixels that are left."""
         minimal = fit_minimal_samples(
             self.samples, self.h, self.w, self.K, minimal_samples, self.rng
         )
         windows = fit_windows(self.samples, self.h, self.w, self.K)
-        return [
-            Candidates(windows, MotionSource.WINDOW),
-            Candidates(minimal, MotionSource.MINIMAL),
-        ]
+        return {MotionSource.WINDOW: windows, MotionSource.MINIMAL: minimal}
 
-    def run_round(self, candidates: Sequence[Candidates]) -> list[Motion]:
-        """Fit the best candidates to the pixels that are left.
+    def run_round(self, proposals: Proposals) -> list[Candidate]:
+        """Fit the best proposals to the pixels that are left.
 
         Returns:
             The distinct ones, the largest score first. Those behind the winner also
             differ from the motions of earlier rounds.
         """
-        best = self._fit_best(candidates)
+        best = self._fit_best(proposals)
         best.sort(key=lambda x: x.score, reverse=True)
-        ranked: list[Motion] = []
+        ranked: list[Candidate] = []
         for candidate in best:
             others = [*ranked, *self.ranked] if ranked else []
             if candidate.score > 0 and is_new(self.grid, candidate.pose, others):
@@ -212,10 +207,10 @@ class _Search:
         self.ranked.extend(ranked)
         return ranked
 
-    def _fit_best(self, candidates: Sequence[Candidates]) -> list[_ScoredCandidate]:
-        """Fit the distinct candidates with the largest scores to the pixels left."""
-        poses = np.concatenate([some.poses for some in candidates])
-        sources = [some.source for some in candidates for _ in some.poses]
+    def _fit_best(self, proposals: Proposals) -> list[_ScoredCandidate]:
+        """Fit the distinct proposals with the largest scores to the pixels left."""
+        poses = np.concatenate(list(proposals.values()))
+        sources = [source for source, some in proposals.items() for _ in some]
         scores = self._scores(poses)
         # radians, and translations in units of the typical depth
         units = np.array([1.0, 1.0, 1.0, self.inverse_depth])
@@ -231,7 +226,7 @@ class _Search:
             best.append(_ScoredCandidate(score, pose, sources[k], iterations))
         return best
 
-    def _finish(self, candidate: _ScoredCandidate) -> Motion:
+    def _finish(self, candidate: _ScoredCandidate) -> Candidate:
         """Fit a motion once more, then estimate its noise, and fit it with that noise."""
         annealed = candidate.pose.copy()
         iterations = self._anneal(FOUND_MOTION_ANNEALING, annealed)
@@ -246,20 +241,20 @@ class _Search:
         )
         after, before = self._scores(np.stack([reestimated, annealed]))
         is_as_good = after > REESTIMATED_MIN_SCORE * before
-        stats = HypothesisStats(
+        return Candidate(
+            reestimated if is_as_good else annealed,
             inlier_ratio=float(inlier_ratio * self.remaining_ratio),
             flow_noise_px=float(flow_noise_px),
             depth_noise=float(depth_noise),
             source=candidate.source,
             iterations=int(candidate.iterations + iterations + more),
         )
-        return Motion(reestimated if is_as_good else annealed, stats)
 
-    def remove_inliers(self, motion: Motion) -> None:
+    def remove_inliers(self, motion: Candidate) -> None:
         """Reduce the weights of the pixels that follow a motion."""
         noise = kernels.residual_noise(
-            max(motion.stats.flow_noise_px, MIN_INLIER_NOISE_PX),
-            motion.stats.depth_noise,
+            max(motion.flow_noise_px, MIN_INLIER_NOISE_PX),
+            motion.depth_noise,
             INLIER_REMOVAL_CUTOFF * self.cutoff,
         )
         robust = kernels.robust_weights(
@@ -278,7 +273,7 @@ class _Search:
         return robust_fit.anneal(self.samples, self.n, self.K, *schedule, pose)
 
 
-def is_new(grid: PixelGrid, pose: np.ndarray, motions: Sequence[Motion]) -> bool:
+def is_new(grid: PixelGrid, pose: np.ndarray, motions: Sequence[Candidate]) -> bool:
     """Whether a pose (3, 4) differs from each of the motions."""
     poses = [pose, *(motion.pose for motion in motions)]
     others = distances(grid, poses, 0)[1:]

@@ -40,35 +40,47 @@ from hybridvo.hypotheses.refit import (
 )
 from hybridvo.hypotheses.remembered import memory_scores
 from hybridvo.hypotheses.search import distances
-from hybridvo.hypotheses.types import HypothesisSet, HypothesisStats, MotionSource
-from hybridvo.judge.choice import (
-    ChoiceEvidence,
-    choice_evidence,
-    choice_probability,
-    cue_probability,
-)
+from hybridvo.hypotheses.types import Candidate, HypothesisSet, MotionSource
 from hybridvo.solver import kernels
 from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.refine_flow import Selection
 
 # Margin of the best score where there is no other motion, and the largest that counts, nats.
 MAX_SCORE_MARGIN = 8.0
+# Fraction of the view that is added to a share before its logarithm is evidence.
+LEAST_SHARE = 0.01
 
 
-class Candidate(NamedTuple):
-    """A motion to be scored.
+class ChoiceEvidence(NamedTuple):
+    """What speaks for a motion that PWVO chose among others.
 
     Attributes:
-        pose: (3, 4) ``T_curr_prev``, metres.
-        stats: how well the pixels agree with it.
-        parent: number of the motion of the search that it goes back to, or its own.
-        mask: (h, w) weights with which a refit was made; None for motions of the search.
+        margin: by how much its score exceeds that of any other motion of any flow.
+        first_margin: the same in the first flow alone, of the motion that was best there.
+        log_share: log of the fraction of the view that follows it.
+        log_rival_share: the same of the best other motion; that of nothing where there is none.
     """
 
-    pose: np.ndarray
-    stats: HypothesisStats
-    parent: int
-    mask: np.ndarray | None = None
+    margin: float
+    first_margin: float
+    log_share: float
+    log_rival_share: float
+
+
+class CueEvidence(NamedTuple):
+    """What speaks for a motion that hand-made cues chose among others.
+
+    Attributes:
+        margin: of its score to that of the next motion; 0 where there is none.
+        is_alone: 1 where there is no other motion, else 0.
+        log_ratio_beside: log of its inlier ratio where there is another motion, else 0.
+        log_ratio_alone: the same where there is none, else 0.
+    """
+
+    margin: float
+    is_alone: float
+    log_ratio_beside: float
+    log_ratio_alone: float
 
 
 class RefitStart(NamedTuple):
@@ -114,7 +126,7 @@ def select_by_cues(
         prior: the expected motion, if there is one; it takes part as a cue.
 
     Returns:
-        The motion, with its probability of being right.
+        The motion, with what speaks for it.
     """
     candidates = cue_candidates(found)
     motions = to_hypotheses(found, candidates)
@@ -125,30 +137,23 @@ def select_by_cues(
     # a prior may choose the motion, but only the image is evidence that it is right
     best = int(np.argmax(scores))
     evidence = cue_evidence(image_scores, best, motions[best].inlier_ratio)
-    probability = cue_probability(evidence)
-    return _select_best(found, candidates, scores, evidence, probability)
+    return _select_best(found, candidates, scores, evidence)
 
 
-def cue_evidence(
-    scores: np.ndarray, best: int, inlier_ratio: float
-) -> tuple[float, ...]:
+def cue_evidence(scores: np.ndarray, best: int, inlier_ratio: float) -> CueEvidence:
     """Return the evidence on whether the motion with the best cue scores is right.
 
     Args:
         scores: (N,) of the motions, by the image alone.
         best: number of the motion.
         inlier_ratio: fraction of the usable pixels that follow it.
-
-    Returns:
-        The margin to the next motion (0 where there is none), whether there is none, and the log
-        of the inlier ratio, once where there is another motion and once where there is none.
     """
     others = np.delete(scores, best)
     explained = float(np.log(inlier_ratio + CUE_MIN_INLIER_RATIO))
     if not len(others):
-        return 0.0, 1.0, 0.0, explained
+        return CueEvidence(0.0, 1.0, 0.0, explained)
     margin = min(float(scores[best] - others.max()), MAX_SCORE_MARGIN)
-    return margin, 0.0, explained, 0.0
+    return CueEvidence(margin, 0.0, explained, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +259,6 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
         chosen.candidates,
         chosen.score,
         evidence,
-        choice_probability(evidence),
         chosen.mask_of(chosen.best),
         chosen.remembered,
     )
@@ -262,12 +266,15 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
 
 def evidence_on_choice(rankings: Sequence[Ranking]) -> ChoiceEvidence:
     """Return what speaks for the motion that is selected from looks at all flows so far."""
-    chosen = surest(rankings)
-    return choice_evidence(
-        margin_of(rankings),
-        rankings[0].margin,
-        chosen.described(chosen.best),
-        best_rival(rankings),
+    look = surest(rankings)
+    chosen = look.described(look.best)
+    rival = best_rival(rankings)
+    rival_share = 0.0 if rival is None else float(np.mean(rival.inliers))
+    return ChoiceEvidence(
+        margin=margin_of(rankings),
+        first_margin=rankings[0].margin,
+        log_share=float(np.log(np.mean(chosen.inliers) + LEAST_SHARE)),
+        log_rival_share=float(np.log(rival_share + LEAST_SHARE)),
     )
 
 
@@ -321,7 +328,7 @@ def rank_by_scorer(
 def search_candidates(found: HypothesisSet) -> list[Candidate]:
     """The motions of the search as candidates, each its own parent."""
     return [
-        Candidate(motion.pose, motion.stats, number)
+        motion._replace(parent=number)
         for number, motion in enumerate(found.motions)
     ]
 
@@ -331,7 +338,7 @@ def cue_candidates(found: HypothesisSet) -> list[Candidate]:
     return [
         candidate
         for candidate in search_candidates(found)
-        if candidate.stats.source is not MotionSource.RUNNER_UP
+        if candidate.source is not MotionSource.RUNNER_UP
     ]
 
 
@@ -347,12 +354,10 @@ def _refit(
         mask = mask_weights(start.static)
         if mask_coverage(grid, mask) < MIN_COVERAGE:
             continue
-        pose, stats = fit_in_mask(
-            grid.samples, mask, grid.K, start.pose, found.cutoff
-        )
-        if np.isfinite(pose).all() and stats.inlier_ratio > 0:
+        refit = fit_in_mask(grid.samples, mask, grid.K, start.pose, found.cutoff)
+        if np.isfinite(refit.pose).all() and refit.inlier_ratio > 0:
             parent = candidates[number].parent
-            refits.append(Candidate(pose, stats, parent, mask))
+            refits.append(refit._replace(parent=parent, mask=mask))
     return refits
 
 
@@ -384,10 +389,9 @@ def to_hypotheses(
     grid = found.grid
     described = []
     for candidate in candidates:
-        stats = candidate.stats
         noise = kernels.residual_noise(
-            max(stats.flow_noise_px, MIN_INLIER_NOISE_PX),
-            stats.depth_noise,
+            max(candidate.flow_noise_px, MIN_INLIER_NOISE_PX),
+            candidate.depth_noise,
             found.cutoff,
         )
         inliers = kernels.robust_weights(
@@ -395,10 +399,10 @@ def to_hypotheses(
         )
         hypothesis = Hypothesis(
             T_curr_prev=pose_matrix(candidate.pose),
-            source=stats.source.value,
+            source=candidate.source.value,
             inlier_ratio=mask_coverage(grid, inliers),
-            flow_noise_px=stats.flow_noise_px,
-            depth_noise=stats.depth_noise,
+            flow_noise_px=candidate.flow_noise_px,
+            depth_noise=candidate.depth_noise,
             inliers=inliers.reshape(grid.shape[:2]),
         )
         described.append(hypothesis)
@@ -410,7 +414,6 @@ def _select_best(
     candidates: Sequence[Candidate],
     scores: np.ndarray,
     evidence: tuple[float, ...],
-    probability: float,
     mask: np.ndarray | None = None,
     remembered: np.ndarray | None = None,
 ) -> Selection:
@@ -426,11 +429,10 @@ def _select_best(
     best = candidates[order[0]]
     return Selection(
         T_curr_prev=pose_matrix(best.pose),
-        noise=Noise(*best.stats.noise),
+        noise=Noise(*best.noise),
         mask=mask,
         coverage=mask_coverage(found.grid, mask),
         evidence=evidence,
-        probability=float(np.nan_to_num(probability)),
         hypotheses=tuple(hypotheses),
-        iterations=best.stats.iterations,
+        iterations=best.iterations,
     )

@@ -27,40 +27,33 @@ class MotionSource(enum.StrEnum):
     """A motion of the search, fitted again inside a static mask."""
 
 
-@dataclass(frozen=True)
-class HypothesisStats:
-    """How well the pixels agree with one motion, and how it was found.
+class Candidate(NamedTuple):
+    """One rigid motion that many pixels follow, and how it was found.
 
     Attributes:
+        pose: (3, 4) ``T_curr_prev``, metres.
         inlier_ratio: weight of the inliers over that of all usable pixels, from 0 to 1.
         flow_noise_px: standard deviation of the inliers' flow, px.
         depth_noise: standard deviation of the inliers' log depth.
         source: the kind of candidate that it was fitted from.
         iterations: Gauss-Newton steps spent on it.
+        parent: number of the motion of the search that it goes back to, or its own.
+        mask: (h, w) weights with which a refit was made; None for motions of the search.
     """
 
+    pose: np.ndarray
     inlier_ratio: float
     flow_noise_px: float
     depth_noise: float
     source: MotionSource
-    iterations: int
+    iterations: int = 0
+    parent: int = 0
+    mask: np.ndarray | None = None
 
     @property
     def noise(self) -> tuple[float, float]:
         """Standard deviations of the inliers' flow, px, and of their log depth."""
         return self.flow_noise_px, self.depth_noise
-
-
-class Motion(NamedTuple):
-    """One rigid motion that many pixels follow.
-
-    Attributes:
-        pose: (3, 4) ``T_curr_prev``, metres.
-        stats: how well the pixels agree with it.
-    """
-
-    pose: np.ndarray
-    stats: HypothesisStats
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +71,7 @@ class HypothesisSet:
 
     pair: FramePair
     grid: PixelGrid
-    motions: tuple[Motion, ...]
+    motions: tuple[Candidate, ...]
     cutoff: float
     lacks_sky: bool = False
     is_complete: bool = False

@@ -12,15 +12,15 @@ seeds 900 to 905 with DIS flow, and 100 scenes without an answer.
 
 CHOICE_RIGHT = (0.325, 0.421, -0.734, 0.174, -0.032)
 """Of a motion chosen among all that were found in the flows of a pair, in the evidence of
-:class:`hybridvo.judge.choice.ChoiceEvidence`: 1020 of 1055 right, after one, two and three flows,
-on seven makers; those in which something moves in a real view count ten times as much as the
+:class:`hybridvo.hypotheses.select.ChoiceEvidence`: 1020 of 1055 right, after one, two and three
+flows, on seven makers; those in which something moves in a real view count ten times as much as the
 others, which hardly ever fail. AUROC of the answers to 220 pairs of kitchen, box and semi-real,
 each maker judged by a fit on the others: .86 (the margin alone: .76). More evidence moved no
 figure: number of flows, texture that is left unexplained, distance between search and fit,
 standard deviation. By the method of ``tools/calibrate.py`` on a selection of its makers, not by a
 run of it."""
 CUES_RIGHT = (0.97, 2.80, 2.12, 4.49, 2.28)
-"""Of the evidence of the cues (see :func:`hybridvo.hypotheses.select.cue_evidence`). 396 of 475
+"""Of the evidence of the cues (:class:`hybridvo.hypotheses.select.CueEvidence`). 396 of 475
 right on 260 semi-real pairs, the heavy ones, static recordings, scenarios and 15 pairs of unrelated
 images (``tools/calibrate.py --pairs 260``): AUROC .86, calibration error .03. By the margin alone,
 with a large one where there is no other motion, it was .62 and .11, and all unrelated images were
@@ -28,19 +28,32 @@ believed."""
 DIRECT_EXACT = (-3.38, 2.05, -3.62, -0.61, -18.73)
 DIRECT_OF_SCENE = (-1.76, 0.13)
 """Of a motion found without flow: that it is the motion of one thing, in the evidence of
-:class:`hybridvo.judge.choice.DirectEvidence`, and that the thing is the scene, in the last of it
-alone. Their product is fitted, and the first with the certainty of a belief where that was asked
-(``tools/calibrate.py --direct --pairs 24``): 5373 of 6712 right, where right is an error of less
-than a quarter of a pixel of 320 columns, or of three times that of a fit to the true static
+:class:`hybridvo.hypotheses.direct_evidence.DirectEvidence`, and that the thing is the scene, in the
+last of it alone. Their product is fitted, and the first with the certainty of a belief where that
+was asked (``tools/calibrate.py --direct --pairs 24``): 5373 of 6712 right, where right is an error
+of less than a quarter of a pixel of 320 columns, or of three times that of a fit to the true static
 pixels; AUROC .985, calibration error .02; 27 wrong ones are above .9. Without the fraction of the
 texture that is left unexplained, and so without the second one, AUROC is .968, calibration error
 .04, and 2011 of 5427 right ones fall below .95; each maker left out, .962 and 2094. By the standard
 deviation as a fraction of the ego flow, without films, a tenth of the sure motions of what was
 believed static were wrong in images of 160 columns."""
+CERTAINTY_BONUS = 2.0
+"""Nats that are added to the certainty of a belief where a motion of what it holds static is
+judged: films say 10 (``tools/calibrate.py --direct``), but in none of them is a whole belief wrong
+from the start."""
+DIRECT_INFLATION = 3.0
+"""Factor on the covariance of a motion by images and depth maps alone. The squared error of its
+edges in units of the covariance should be 5.3 in the median. Without the factor it is 8.5 on six
+tripods and 19.3 on TartanAir: the tripods alone ask for 1.6, TartanAir alone for 3.6. On four
+rendered walks, whose noise is milder than a sensor's, it is 1.9 (``tools/benchmark.py sigmas``
+shows a change)."""
 DIRECT_PROBABILITY = 0.95
 """That from which no flow is computed. From .9 on, 14 instead of 7 steps of clips with large movers
 are wrong and ``ok`` (``tools/benchmark.py memory_unseen``, without memory), and two more escalators
 of 60, while a turning Kinect needs flow in 29 instead of 41 of 99 frames."""
+AGREEMENT_RIGHT = 0.25
+"""Weight of the log of how far a refined motion agrees with the one that was chosen, beside the
+log odds of the choice. It was fitted on 458 answers beside a margin alone."""
 WITHOUT_IMAGES_RIGHT = 0.5
 """Probability of a motion that no image confirms: by depth maps alone, where all points are in view
 and follow it, or as it was expected."""

@@ -14,8 +14,9 @@ import numpy as np
 
 from hybridvo.core.geometry import invert, mean_flow, se3_exp, se3_log
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.core.results import Motion, Reason, Status, Term
 from hybridvo.core.types import FramePair
+from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.frame_images import blurred
 from hybridvo.judge.calibration import (
     CLEAR_DEPTH_LEAD,
@@ -27,7 +28,7 @@ from hybridvo.judge.calibration import (
     IMAGE_LEAD_GAIN,
     MIN_LEAD,
 )
-from hybridvo.judge.findings import Finding, Question, towards
+from hybridvo.judge.findings import Finding, towards
 from hybridvo.solver.calibration import (
     MIN_IMAGE_CORRELATION,
     MIN_IN_VIEW,
@@ -74,18 +75,24 @@ class ImageMatch(NamedTuple):
     in_view: float  # fraction of the weight inside the current image
 
 
-def against_images_and_depth(question: Question) -> Finding | None:
+def against_images_and_depth(
+    evidence: PairEvidence, motion: Motion
+) -> Finding | None:
     """Find what the images or the depth maps state against a motion.
 
     Flow that was computed from the images themselves is not compared with them.
+
+    Args:
+        evidence: of the pair.
+        motion: of the pair, with the weights of its pixels.
 
     Returns:
         Where one of them contradicts it, that it is degraded and hardly probable, with a
         covariance that covers the motion to which they lead; where images of another origin than
         the flow lead a little away, a covariance that covers that; else None.
     """
-    pair = question.pair
-    motion = question.motion
+    pair = evidence.pair
+    options = evidence.options.refine
     if motion.weights is None or pair.prev.depth is None:
         return None
     # the two depth maps already contradict each other
@@ -93,12 +100,13 @@ def against_images_and_depth(question: Question) -> Finding | None:
         return None
     images = None
     contradiction = None
-    if question.flow_source != "dis":
-        images = by_images_alone(pair, motion, question.options)
+    if not (evidence.flow_is_of_the_images or _is_by_images_alone(motion)):
+        images = by_images_alone(pair, motion, options)
     if images is not None:
-        contradiction = _against(pair, motion, images, question.flow_source)
+        source = evidence.flow_source or "callable"
+        contradiction = _against(pair, motion, images, source)
     if contradiction is None:
-        contradiction = contradiction_by_depth(pair, motion, question.options)
+        contradiction = contradiction_by_depth(pair, motion, options)
     if contradiction is not None:
         return Finding(
             towards(motion, contradiction.T_curr_prev),
@@ -106,6 +114,11 @@ def against_images_and_depth(question: Question) -> Finding | None:
             Status.degraded(Reason.CONTRADICTED, contradiction.message),
         )
     return None if images is None else disagreement(motion, images)
+
+
+def _is_by_images_alone(motion: Motion) -> bool:
+    """Whether no flow took part in a motion, but the images did."""
+    return Term.IMAGES in motion.terms and Term.FLOW not in motion.terms
 
 
 class ByImages(NamedTuple):
@@ -118,7 +131,7 @@ class ByImages(NamedTuple):
 
 
 def by_images_alone(
-    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
+    pair: FramePair, motion: Motion, options: RefineOptions | None = None
 ) -> ByImages | None:
     """Align the static pixels of an answer once more, by the images alone.
 
@@ -153,7 +166,7 @@ def by_images_alone(
     return ByImages(T, covariance, _match(there), _match(here))
 
 
-def disagreement(motion: RelativePose, images: ByImages) -> Finding | None:
+def disagreement(motion: Motion, images: ByImages) -> Finding | None:
     """Find by how much the images disagree with a motion on flow that does not come from them.
 
     What flow of another origin errs by is not known from the flow. Where the images lead away
@@ -178,7 +191,7 @@ def disagreement(motion: RelativePose, images: ByImages) -> Finding | None:
 
 
 def _against(
-    pair: FramePair, motion: RelativePose, images: ByImages, flow_source: str
+    pair: FramePair, motion: Motion, images: ByImages, flow_source: str
 ) -> Contradiction | None:
     """Return the evidence of the images against a motion, or None.
 
@@ -216,7 +229,7 @@ def _match(images: ImagesAt) -> ImageMatch:
 
 
 def contradiction_by_depth(
-    pair: FramePair, motion: RelativePose, options: RefineOptions | None = None
+    pair: FramePair, motion: Motion, options: RefineOptions | None = None
 ) -> Contradiction | None:
     """Return the evidence of the depth maps against a motion, or None.
 

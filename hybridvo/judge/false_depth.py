@@ -15,11 +15,11 @@ import numpy as np
 from hybridvo.core.geometry import ego_flow, valid_depth
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, RelativePose, Status
+from hybridvo.core.results import Motion, Reason, Status
 from hybridvo.core.types import Frame, FramePair
+from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.calibration import UNSTATED_FLOW_STD_PX
 from hybridvo.flow.frame_images import blurred
-from hybridvo.flow.providers import with_flow
 from hybridvo.judge.calibration import (
     CONTRADICTED_RIGHT,
     EXACT_SURFACE,
@@ -30,7 +30,7 @@ from hybridvo.judge.calibration import (
     OFF_SURFACE_GREY,
     OFF_SURFACE_PX,
 )
-from hybridvo.judge.findings import Finding, Question
+from hybridvo.judge.findings import Finding
 
 # every so many rows and columns are looked at
 STRIDE = 8
@@ -44,23 +44,25 @@ PATCH = 9
 SAMPLED = np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
 
 
-def false_depth(question: Question) -> Finding | None:
+def false_depth(evidence: PairEvidence, motion: Motion) -> Finding | None:
     """Find that the depth of a pair is a surface that the images do not show.
+
+    Args:
+        evidence: of the pair, which has depth.
+        motion: of the pair.
 
     Returns:
         That the motion is degraded, with a covariance as wide as its translation, whose length
         and direction rest on the depth; None where the depth may be right.
     """
-    pair = question.pair
-    motion = question.motion
-    assert pair.prev.depth is not None
-    surface = _surface_of(pair.prev)
+    surface = _surface_of(evidence.pair.prev)
     if surface is None:
         return None
-    pair = with_flow(pair, question.flow)
+    pair = evidence.with_flow
     if pair.flow is None:
         return None
-    off = ratio_off_surface(pair, motion, surface, question.options.cutoff)
+    cutoff = evidence.options.refine.cutoff
+    off = ratio_off_surface(pair, motion, surface, cutoff)
     if off <= MAX_OFF_SURFACE:
         return None
     step = np.concatenate([motion.T_curr_prev[:3, 3], np.zeros(3)])
@@ -128,7 +130,7 @@ def _on_linear(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def ratio_off_surface(
     pair: FramePair,
-    motion: RelativePose,
+    motion: Motion,
     surface: np.ndarray,
     cutoff: float = RefineOptions.cutoff,
 ) -> float:

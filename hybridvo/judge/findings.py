@@ -10,28 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybridvo.core.geometry import invert, se3_log
-from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import Reason, RelativePose, Status
-from hybridvo.core.types import FramePair
-from hybridvo.flow.providers import FlowProvider
-
-
-class Question(NamedTuple):
-    """A motion that is to be judged, and what it can be held against.
-
-    Attributes:
-        pair: two frames.
-        motion: their motion, with the weights of its pixels.
-        flow_source: what its flow came from; ``dis`` where that was the images.
-        flow: computes the flow of a pair that comes without; None: nothing does.
-        options: of the refinement: cutoff of the robust kernels, number of tiles.
-    """
-
-    pair: FramePair
-    motion: RelativePose
-    flow_source: str = "dis"
-    flow: FlowProvider | None = None
-    options: RefineOptions = RefineOptions()
+from hybridvo.core.results import Motion, Reason, RelativePose, Status
 
 
 class Finding(NamedTuple):
@@ -54,7 +33,7 @@ def covering(T_apart: np.ndarray) -> np.ndarray:
     return np.outer(step, step)
 
 
-def towards(motion: RelativePose, T_curr_prev: np.ndarray) -> np.ndarray:
+def towards(motion: Motion, T_curr_prev: np.ndarray) -> np.ndarray:
     """Return the covariance (6, 6) with which a motion covers another one (4, 4)."""
     return covering(T_curr_prev @ invert(motion.T_curr_prev))
 

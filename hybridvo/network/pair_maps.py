@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.special import logit
 
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.options import Options
@@ -23,11 +22,10 @@ from hybridvo.hypotheses.select import (
     rank_by_scorer,
     surest,
 )
-from hybridvo.judge.choice import choice_probability
 from hybridvo.network.hypothesis_inputs import HypothesisInputs
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.scorer import PWVOScorer
-from hybridvo.network.selection import INVALID_LOG_SCALE, seed_weights
+from hybridvo.network.selection import EVIDENCE, INVALID_LOG_SCALE, seed_weights
 from hybridvo.solver.noise_estimation import START_NOISE
 from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.torch.tools import has_torch_geometry, uncompiled
@@ -37,7 +35,7 @@ class PairLook(NamedTuple):
     """The surest hypothesis of a pair.
 
     Attributes:
-        prediction: the maps for it, (1, 6, h, w), with its ``lead``.
+        prediction: the maps for it, (1, 6, h, w), with what speaks for it.
         inputs: the pair, with this hypothesis alone.
         hypothesis: it and its noise.
     """
@@ -99,7 +97,7 @@ def predict_pairs(
         motion=torch.cat([part.motion for part in parts]),
         log_scale=torch.cat([_log_scale(part) for part in parts]),
         image_size=camera.shape,
-        lead=torch.cat([_lead(part) for part in parts]),
+        evidence=torch.cat([_evidence(part) for part in parts]),
     )
     if batch is None:
         return maps
@@ -132,7 +130,7 @@ def look_at_pair(
     ranking = rank_by_scorer(found, scorer, options)
     best = ranking.candidates[ranking.best]
     inputs = scorer.pair_inputs.with_hypotheses(
-        best.pose[None], np.array([best.stats.noise]), [0]
+        best.pose[None], np.array([best.noise]), [0]
     )
     return PairLook(maps_of_best(scorer, [ranking]), inputs, best)
 
@@ -155,10 +153,11 @@ def maps_of_best(
     usable = scorer.pair_inputs.usable[:, None]
     uncertain = maps.log_scale.clamp(min=INVALID_LOG_SCALE)
     log_scale = torch.where(usable, maps.log_scale, uncertain)
-    probability = choice_probability(evidence_on_choice(rankings))
-    lead = maps.motion.new_tensor([logit(probability)])
+    evidence = maps.motion.new_tensor(
+        [evidence_on_choice(rankings)], dtype=torch.float64
+    )
     size = ranking.found.grid.size
-    return PixelwisePrediction(maps.motion, log_scale, size, lead)
+    return PixelwisePrediction(maps.motion, log_scale, size, evidence)
 
 
 def with_patches(
@@ -182,7 +181,7 @@ def with_patches(
     for each in hypotheses:
         T = np.eye(4) if each is None else pose_matrix(each.pose)
         poses.append(T)
-        noise.append(START_NOISE if each is None else each.stats.noise)
+        noise.append(START_NOISE if each is None else each.noise)
     is_known = torch.tensor([each is not None for each in hypotheses])
     weights = seed_weights(maps) * is_known.to(maps.motion)[:, None, None]
     device = batch.flow.device
@@ -199,7 +198,8 @@ def _no_motion(network: HypothesisNetwork) -> PixelwisePrediction:
     """No motion, of which every pixel is uncertain."""
     nothing = next(network.parameters()).new_zeros(1, 6, 1, 1)
     uncertain = nothing + INVALID_LOG_SCALE
-    return PixelwisePrediction(nothing, uncertain, lead=nothing.flatten()[:1])
+    unknown = nothing.new_full((1, EVIDENCE), torch.nan, dtype=torch.float64)
+    return PixelwisePrediction(nothing, uncertain, evidence=unknown)
 
 
 def _on_grid(
@@ -218,6 +218,6 @@ def _log_scale(prediction: PixelwisePrediction) -> torch.Tensor:
     return prediction.log_scale
 
 
-def _lead(prediction: PixelwisePrediction) -> torch.Tensor:
-    assert prediction.lead is not None
-    return prediction.lead
+def _evidence(prediction: PixelwisePrediction) -> torch.Tensor:
+    assert prediction.evidence is not None
+    return prediction.evidence

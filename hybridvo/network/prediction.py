@@ -5,19 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import expit
 
 from hybridvo.core.euler import euler_transform
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
+    Motion,
     MotionPrior,
     PixelwisePrediction,
     Reason,
-    RelativePose,
     StageFailed,
     Status,
+    Term,
 )
 from hybridvo.core.types import FramePair
+from hybridvo.hypotheses.select import ChoiceEvidence
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.pair_maps import predict_pairs
@@ -44,7 +45,7 @@ def estimate_by_pwvo(
     prior: MotionPrior | None,
     options: Options,
     seed: int,
-) -> RelativePose:
+) -> Motion:
     """Estimate the camera motion of a pair by PWVO alone, without a refinement.
 
     Args:
@@ -64,13 +65,13 @@ def estimate_by_pwvo(
     with single_threaded_inference():
         maps = predict_pairs(network, [pair], [prior], options, seed)
     found = selected_motion(maps, "softmax")
-    assert maps.lead is not None
-    probability = float(expit(float(maps.lead[0])))
-    if found.ok and probability < options.select.min_probability:
-        text = f"another motion may be the camera's: {100 * probability:.0f} % sure"
-        status = Status.degraded(Reason.AMBIGUOUS_MOTION, text)
-        found = found.replace(status=status)
-    return found.replace(probability=probability)
+    assert maps.evidence is not None
+    evidence = maps.evidence[0].tolist()
+    if np.isnan(evidence).any():
+        raise StageFailed(
+            Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion"
+        )
+    return found.replace(evidence=ChoiceEvidence(*evidence))
 
 
 def usable_inputs(pair: FramePair) -> NetworkInputs:
@@ -87,7 +88,7 @@ def usable_inputs(pair: FramePair) -> NetworkInputs:
     return inputs
 
 
-def selected_motion(maps: PixelwisePrediction, selection: str) -> RelativePose:
+def selected_motion(maps: PixelwisePrediction, selection: str) -> Motion:
     """The selected motion of the maps of one pair, with the scales selected as it is."""
     pose = select_pose(maps, selection).double()
     T = euler_transform(pose)[0].cpu().numpy()
@@ -95,11 +96,11 @@ def selected_motion(maps: PixelwisePrediction, selection: str) -> RelativePose:
     rotation_deg = scales[:3]
     translation_m = scales[3:]
     variance = 2 * np.concatenate([translation_m, np.deg2rad(rotation_deg)]) ** 2
-    return RelativePose(
+    return Motion(
         T_curr_prev=T,
         covariance=np.diag(variance),
         status=_network_status(float(rotation_deg.max())),
-        terms=("flow", "depth"),
+        terms=(Term.FLOW, Term.DEPTH),
     )
 
 

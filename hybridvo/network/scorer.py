@@ -77,7 +77,7 @@ class PWVOScorer:
     def _look(self, candidates: Sequence[Candidate]) -> None:
         """Look at further candidates, which are all refits or all of the search."""
         poses = np.stack([candidate.pose for candidate in candidates])
-        noise = np.array([candidate.stats.noise for candidate in candidates])
+        noise = np.array([candidate.noise for candidate in candidates])
         parents = [candidate.parent for candidate in candidates]
         inputs = self.pair_inputs.with_hypotheses(poses, noise, parents)
         self.looks.append(self.network.look(inputs, self.first))

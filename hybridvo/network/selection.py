@@ -49,6 +49,8 @@ MAX_LOG_SCALE = 50.0
 
 MOTION_SIZE = 6
 """Components of a motion: three angles and a translation."""
+EVIDENCE = 4
+"""Numbers that speak for the motion of a map."""
 MAP_DIMENSIONS = 4
 """Of a batch of motions by pixel, (B, 6, h, w)."""
 IMAGE_DIMENSIONS = 2
@@ -96,9 +98,11 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
         T = select_motion(maps, method)
     if maps.log_scale is None:
         return PoseSeed(T, None)
-    # without a margin, the network was used for one motion only: no evidence either way
-    lead = T.new_zeros(len(T)) if maps.lead is None else maps.lead
-    return PoseSeed(T, seed_weights(maps), lead.detach(), covariance)
+    evidence = maps.evidence
+    if evidence is None:
+        # the network was used for one motion only: no evidence either way
+        evidence = T.new_full((len(T), EVIDENCE), torch.nan)
+    return PoseSeed(T, seed_weights(maps), evidence.detach(), covariance)
 
 
 def _of_patches(
@@ -144,8 +148,8 @@ def _check_maps(maps: PixelwisePrediction) -> None:
     _check_floats("motion", maps.motion, map_shape)
     if maps.log_scale is not None:
         _check_floats("log_scale", maps.log_scale, map_shape)
-    if maps.lead is not None:
-        _check_floats("lead", maps.lead, map_shape[:1])
+    if maps.evidence is not None:
+        _check_floats("evidence", maps.evidence, (*map_shape[:1], EVIDENCE))
     if maps.image_size is None:
         return
     check_kind("select.maps.image_size", maps.image_size, tuple)

@@ -6,9 +6,6 @@ NAME``: what is chosen for a maker is chosen on all others), and which golden ca
 of it in docs/golden_noticed.json.
 """
 
-AGREEMENT_RIGHT = 0.25
-"""Weight of the log of how far a refined motion agrees with the one that was chosen, beside the
-log odds of the choice. It was fitted on 458 answers beside a margin alone."""
 
 # Below, without a unit: fitted on the development seeds of the scenarios
 # (``tools/benchmark.py methods``), on rendered walks with DIS flow, and on the real samples.

@@ -29,16 +29,25 @@ STEPS = 15
 TOLERANCE = 0.1
 
 
+class DepthEvidence(NamedTuple):
+    """What speaks for a motion that no image confirms.
+
+    Attributes:
+        in_view: of the static weight, the fraction that is visible on a surface of the current map.
+        inlier_ratio: of what is visible, the fraction that follows the motion.
+    """
+
+    in_view: float = 1.0
+    inlier_ratio: float = 1.0
+
+
 class DepthMotion(NamedTuple):
     """A motion by two depth maps and what was expected of it."""
 
     known: MotionPrior
     # (6, 6) of the depth maps alone
     information: np.ndarray
-    # of the static weight, the fraction that is visible on a surface of the current map
-    in_view: float
-    # of what is visible, the fraction that follows the motion
-    inlier_ratio: float
+    evidence: DepthEvidence
     weights: np.ndarray  # (H, W) float32, 1 where a point follows the motion
 
     def rests_on(self, expected: MotionPrior) -> bool:
@@ -119,7 +128,9 @@ def _seen(
     return DepthMotion(
         known,
         information,
-        seen / max(len(planes.points), 1),
-        int(np.count_nonzero(follows)) / max(seen, 1),
+        DepthEvidence(
+            seen / max(len(planes.points), 1),
+            int(np.count_nonzero(follows)) / max(seen, 1),
+        ),
         mask,
     )

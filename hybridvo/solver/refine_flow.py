@@ -15,7 +15,8 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import (
     UNINFORMATIVE_COVARIANCE,
     Hypothesis,
-    RelativePose,
+    Motion,
+    Term,
 )
 from hybridvo.core.types import FramePair
 from hybridvo.solver import kernels, robust_fit
@@ -67,8 +68,7 @@ class Selection:
         noise: estimated so far; None: not estimated, and the motion is only a start.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None.
         coverage: fraction of the usable pixels' weight that the mask leaves.
-        evidence: on whether it is the camera's, see :class:`hybridvo.judge.choice.ChoiceEvidence`.
-        probability: that it is the camera's motion, calibrated in the evidence.
+        evidence: on whether it is the camera's; its type says what it is.
         hypotheses: all candidates, the selected one first.
         iterations: Gauss-Newton steps spent on it.
     """
@@ -78,7 +78,6 @@ class Selection:
     mask: np.ndarray | None = None
     coverage: float = 1.0
     evidence: tuple[float, ...] = ()
-    probability: float = 1.0
     hypotheses: tuple[Hypothesis, ...] = ()
     iterations: int = 0
 
@@ -144,8 +143,7 @@ def refine_pair(
     grid: PixelGrid | None = None,
     weights: np.ndarray | None = None,
     options: RefineOptions | None = None,
-    min_probability: float = 0.0,
-) -> RelativePose:
+) -> Motion:
     """Refine the motion of a pair.
 
     Args:
@@ -154,10 +152,9 @@ def refine_pair(
         grid: the pixels of the pair; None: they are prepared here.
         weights: (H, W) factors on the information of each pixel, for a grid that is prepared here.
         options: of the refinement.
-        min_probability: the motion is degraded if its probability is below this.
 
     Returns:
-        The motion with covariance and status; the identity where it failed.
+        The motion with covariance, and the status of the fit; the identity where it failed.
 
     Raises:
         StageFailed: The pair has no flow, no depth, or too few usable pixels.
@@ -186,7 +183,6 @@ def refine_pair(
     motion = _motion(T, fit.at, estimate).replace(
         iterations=coarse_steps + steps + fit.iterations,
         hypotheses=start.hypotheses,
-        probability=start.probability,
         evidence=start.evidence,
     )
     summary = FitSummary(
@@ -196,20 +192,13 @@ def refine_pair(
         converged=_has_converged(fit),
         max_steps=FULL_STEPS,
     )
-    status = status_of(
-        summary,
-        depths,
-        start.probability,
-        min_probability,
-        degeneracy(stated, grid.size, options),
-    )
+    status = status_of(summary, depths, degeneracy(stated, grid.size, options))
     inlier_ratio = min(1.0, motion.inlier_ratio * start.coverage)
     motion = motion.replace(status=status, inlier_ratio=inlier_ratio)
     if not status.usable:
         return motion.replace(
             T_curr_prev=np.eye(4),
             covariance=UNINFORMATIVE_COVARIANCE.copy(),
-            probability=0.0,
         )
     return motion.replace(covariance=stated.covariance)
 
@@ -308,13 +297,12 @@ def _shared_errors(
 
 def _motion(
     T: np.ndarray, at: FlowLinearization, estimate: NoiseEstimate
-) -> RelativePose:
+) -> Motion:
     """Return the motion (4, 4) with what the fit states, but without covariance and status."""
     total = max(at.external_sum, 1e-12)
-    return RelativePose(
+    return Motion(
         T_curr_prev=T,
-        method="classical",
-        terms=("flow",),
+        terms=(Term.FLOW,),
         inlier_ratio=at.inlier_sum / total,
         cost=at.cost / total,
         residual_scale_px=float(estimate.noise.flow_px),

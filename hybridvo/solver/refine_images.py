@@ -13,7 +13,7 @@ import numpy as np
 
 from hybridvo.core.geometry import invert, pose_matrix, se3_log
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import PhotometricReport, RelativePose
+from hybridvo.core.results import Motion, PhotometricReport, Term
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import blurred
 from hybridvo.solver.calibration import (
@@ -44,10 +44,10 @@ PIXELS = 16_000
 
 def refine_photometric(
     pair: FramePair,
-    pose: RelativePose,
+    pose: Motion,
     prior_inflation: float = FLOW_PRIOR_INFLATION,
     options: RefineOptions | None = None,
-) -> RelativePose:
+) -> Motion:
     """Refine the motion of a pair by its two images and its two depth maps.
 
     Args:
@@ -58,8 +58,7 @@ def refine_photometric(
 
     Returns:
         The refined motion; or ``pose`` where images are missing, refused, or add
-        nothing. Its field ``photometric``, and a message in its status, state which
-        and why.
+        nothing. Its field ``photometric`` states which and why.
     """
     options = options or RefineOptions()
     if not _can_be_refined(pair, pose):
@@ -76,7 +75,7 @@ def refine_photometric(
             f"{len(index)} static pixels with texture and depth, "
             f"{MIN_TEXTURED_PIXELS} needed"
         )
-        return _refused(pose, PhotometricReport(refusal=refusal))
+        return pose.replace(photometric=PhotometricReport(refusal=refusal))
 
     prior = Prior.around(pose.T_curr_prev, flow_information)
     images = ImageFactor(pair, weights, index, options, pose.depth_noise)
@@ -94,19 +93,19 @@ def refine_photometric(
     )
     if joint_covariance is None:
         refusal = "the joint information is not definite"
-        return _refused(pose, replace(report, refusal=refusal))
+        return pose.replace(photometric=replace(report, refusal=refusal))
     added = np.linalg.eigvals(covariance @ there.images.information).real
     if added.max() < MIN_ADDED_INFORMATION:
         return pose.replace(photometric=report)
     return pose.replace(
         T_curr_prev=pose_matrix(T[:3]),
         covariance=joint_covariance,
-        terms=(*pose.terms, "images"),
+        terms=(*pose.terms, Term.IMAGES),
         photometric=replace(report, taken=True),
     )
 
 
-def _can_be_refined(pair: FramePair, pose: RelativePose) -> bool:
+def _can_be_refined(pair: FramePair, pose: Motion) -> bool:
     has_pixels = pose.weights is not None and pair.prev.depth is not None
     return pose.usable and pair.has_images and has_pixels
 
@@ -137,11 +136,3 @@ def _follow(
         if step @ at.information @ step < MIN_ROUND_STD**2:
             break
     return at
-
-
-def _refused(pose: RelativePose, report: PhotometricReport) -> RelativePose:
-    """The motion by flow, with a message that states why the images were not used."""
-    status = pose.status
-    if not status.message:
-        status = replace(status, message=f"images not used: {report.refusal}")
-    return pose.replace(status=status, photometric=report)

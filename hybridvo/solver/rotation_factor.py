@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridvo.core.geometry import invert, se3_exp, se3_log
-from hybridvo.core.results import MotionPrior, RelativePose
+from hybridvo.core.results import MotionPrior, RelativePose, Term
 from hybridvo.solver.calibration import PRIOR_FREEDOM
 
 
@@ -36,5 +36,5 @@ def with_rotation(motion: RelativePose, measured: MotionPrior) -> RelativePose:
     return motion.replace(
         T_curr_prev=se3_exp(gain @ away) @ motion.T_curr_prev,
         covariance=(covariance + covariance.T) / 2,
-        terms=(*motion.terms, "gyroscope"),
+        terms=(*motion.terms, Term.GYROSCOPE),
     )

@@ -1,8 +1,7 @@
-"""When a refined motion is ok, degraded or failed: one set of rules for both backends."""
+"""What a fit to flow states of itself: one set of rules for both backends."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,13 +17,6 @@ from hybridvo.solver.calibration import (
 from hybridvo.solver.covariance import MotionCovariance
 from hybridvo.solver.depths import DepthAgreement
 from hybridvo.solver.newton import tile_size
-
-NO_SEARCH = Status.degraded(
-    Reason.AMBIGUOUS_MOTION,
-    "a batch without weights does not search for other motions, so that this one may be an "
-    "object's; give weights, as of hybridvo.select(hybridvo.PWVO.from_pretrained()(batch)), or "
-    "call hybridvo.estimate for each pair",
-)
 
 LEFT_SEED = Status.degraded(
     Reason.SOLVER_DIVERGED,
@@ -76,19 +68,13 @@ class FitSummary(NamedTuple):
 
 
 def status_of(
-    fit: FitSummary,
-    depths: DepthAgreement | None,
-    probability: float,
-    min_probability: float,
-    degenerate: str = "",
+    fit: FitSummary, depths: DepthAgreement | None, degenerate: str = ""
 ) -> Status:
-    """Return the status of a motion: the first reason that holds, the gravest first.
+    """Return the status of a fit: the first reason that holds, the gravest first.
 
     Args:
         fit: on all pixels.
         depths: how the depths of both frames compare along the motion, or None.
-        probability: that this is the camera's motion; NaN where nothing states it.
-        min_probability: below it the motion is degraded.
         degenerate: what :func:`degeneracy` states.
     """
     if not fit.is_determined:
@@ -110,18 +96,6 @@ def status_of(
         )
     if fit.is_seed:
         return LEFT_SEED
-    if math.isnan(probability):
-        return NO_SEARCH
-    if probability < min_probability:
-        return ambiguous(probability)
     if degenerate:
         return Status.degraded(Reason.DEGENERATE_GEOMETRY, degenerate)
     return Status()
-
-
-def ambiguous(probability: float) -> Status:
-    """Return the status of a motion that may be an object's."""
-    what = "another of the motions found could be the camera's (probability of this one"
-    return Status.degraded(
-        Reason.AMBIGUOUS_MOTION, f"{what} {100 * probability:.0f} %)"
-    )

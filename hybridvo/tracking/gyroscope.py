@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.imu import ImuSamples, with_earlier
-from hybridvo.core.results import MotionPrior, Step
+from hybridvo.core.results import MotionPrior, Step, Term
 from hybridvo.tracking.calibration import (
     GYRO_BIAS_STD,
     GYRO_BIAS_WALK,
@@ -106,7 +106,7 @@ class Gyroscope:
         turned = step.T_curr_prev[:3, :3] @ measured.T_curr_prev[:3, :3].T
         rotation = Rotation.from_matrix(turned).as_rotvec()
         of_images = step.covariance[3:, 3:]
-        if "gyroscope" in step.motion.terms:
+        if Term.GYROSCOPE in step.motion.terms:
             # as it was without the sensor
             kept = np.eye(3) - of_images @ np.linalg.inv(
                 measured.covariance[3:, 3:]

@@ -20,7 +20,7 @@ from hybridvo.core.geometry import (
     invert,
     transform_points,
 )
-from hybridvo.core.results import RelativePose
+from hybridvo.core.results import RelativePose, Term
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
 from hybridvo.flow.frame_images import blurred, gradient_at
@@ -240,9 +240,9 @@ def _certainty_after(
 ) -> float:
     """The certainty in a belief after a motion, given the likelihood ratios (h, w) under it."""
     certainty = BELIEF_DECAY * belief.certainty
-    if "flow" not in motion.terms:
+    if Term.FLOW not in motion.terms:
         # that a belief agrees with itself is no evidence
-        gained = 0.0 if "memory" in motion.terms else CERTAINTY_BY_IMAGES
+        gained = 0.0 if Term.MEMORY in motion.terms else CERTAINTY_BY_IMAGES
         return min(certainty + gained, MAX_CERTAINTY)
     agrees = float(np.sum(belief.log_odds.astype(np.float32) * ratio)) >= 0
     change = log_odds_of(motion.probability)

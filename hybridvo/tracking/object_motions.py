@@ -30,7 +30,7 @@ from hybridvo.core.geometry import (
     valid_depth,
 )
 from hybridvo.core.options import Options
-from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
+from hybridvo.core.results import Motion, Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.frame_images import blurred
 from hybridvo.flow.providers import dis_flow, with_flow
@@ -643,7 +643,7 @@ class _Segmentation:
             np.ascontiguousarray(pose),
             self.options.refine.cutoff,
         )
-        if not np.isfinite(fit.pose).all() or fit.stats.inlier_ratio <= 0:
+        if not np.isfinite(fit.pose).all() or fit.inlier_ratio <= 0:
             return T_curr_prev
         return invert(pose_matrix(fit.pose))
 
@@ -883,6 +883,7 @@ class _Segmentation:
         start = Selection(invert(T_curr_prev))
         own = np.ascontiguousarray(weights[box.pixels])
         refine = self.options.refine
+        motion: Motion
         try:
             grid = PixelGrid(pair, own, refine.coarse_pixels)
             motion = refine_pair(pair, start, grid, options=refine)
@@ -907,8 +908,8 @@ def _bent(parts: Sequence[_Piece], small: Sequence[np.ndarray]) -> _Piece:
 
 
 def _on_images(
-    pair: FramePair, motion: RelativePose, weights: np.ndarray, options: Options
-) -> RelativePose:
+    pair: FramePair, motion: Motion, weights: np.ndarray, options: Options
+) -> Motion:
     """A motion by flow, refined on the images and depth maps inside its mask (H, W).
 
     Flow is drawn along by what moves beside an object, and not as precise there as it states: it
@@ -925,7 +926,7 @@ def _on_images(
     ).replace(weights=None)
 
 
-def _turned_round(motion: RelativePose, T_expected: np.ndarray) -> Fit:
+def _turned_round(motion: Motion, T_expected: np.ndarray) -> Fit:
     """The fit of a motion that leads from the current frame back to the one before."""
     status = motion.status
     if not status.usable:

@@ -23,18 +23,19 @@ from hybridvo.core.geometry import (
     valid_depth,
 )
 from hybridvo.core.results import (
+    Motion,
     MotionPrior,
     Reason,
     RelativePose,
     Status,
+    Term,
     identity_covariance,
 )
 from hybridvo.core.types import Frame, FramePair
-from hybridvo.judge.calibration import WITHOUT_IMAGES_RIGHT
 from hybridvo.judge.consistency import contradiction_by_depth
 from hybridvo.judge.findings import Finding, covering
-from hybridvo.judge.verdict import with_finding
-from hybridvo.solver.depth_alone import motion_by_depth
+from hybridvo.judge.verdict import believed, with_finding
+from hybridvo.solver.depth_alone import DepthEvidence, motion_by_depth
 from hybridvo.tracking.calibration import EQUAL_DEPTH, STANDING_FLOW_PX
 from hybridvo.tracking.tracker_state import TrackerState
 
@@ -149,14 +150,14 @@ def motion_without_image(
         assert expected is not None
         known = MotionPrior(held, expected.covariance)
         went_on = Finding(covering(expected.T_curr_prev @ invert(held)))
-    motion = RelativePose(
+    motion = Motion(
         T_curr_prev=known.T_curr_prev,
         covariance=known.covariance,
         status=Status.degraded(Reason.REPEATED_FRAME, repeat.message),
-        probability=WITHOUT_IMAGES_RIGHT,
-        terms=("depth",) if depth_is_fresh else (),
+        evidence=DepthEvidence(),
+        terms=(Term.DEPTH,) if depth_is_fresh else (),
     )
-    return with_finding(motion, went_on)
+    return with_finding(believed(motion), went_on)
 
 
 def _stands(reference: Frame, step: np.ndarray) -> bool:
@@ -169,7 +170,7 @@ def _agrees_with_standing(pair: FramePair, T_held: np.ndarray) -> bool:
     if pair.prev.depth is None or pair.curr.depth is None:
         return True
     everywhere = np.ones(pair.prev.camera.shape, np.float32)
-    held = RelativePose(T_curr_prev=T_held, weights=everywhere)
+    held = Motion(T_curr_prev=T_held, weights=everywhere)
     return contradiction_by_depth(pair, held) is None
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from hybridvo import pipeline
 from hybridvo.core.belief import Belief
 from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
-from hybridvo.core.results import Edge, MotionPrior, Reason, RelativePose
+from hybridvo.core.results import Edge, MotionPrior, Reason, RelativePose, Term
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.providers import FlowAhead, FlowField, FlowProvider, with_flow
@@ -89,11 +89,11 @@ def find(setup: Setup, state: TrackerState, query: Query) -> Estimate:
     with pairs.flow_ahead() as flow:
         context = replace(setup.context, flow=flow)
         evidence = [pairs.evidence(start, context) for start in pairs.starts]
-        answer = pipeline.first_sure(
+        number, motion = pipeline.first_sure(
             evidence, setup.method, context, query.deadline
         )
-    start = pairs.starts[answer.number]
-    motion = pairs.with_turn(answer.motion, start.frame)
+    start = pairs.starts[number]
+    motion = pairs.with_turn(motion, start.frame)
     found = Estimate(start, motion, pairs.reference, pairs.keyframes, query.given)
     # a place costs as much as the frame did
     is_over = pipeline.is_late(query.deadline)
@@ -143,7 +143,7 @@ def keep(
         motion_model=velocity_after(state, estimate, origin, motion),
         failed=0,
         things=state.things if objects is None else objects.things,
-        used_flow="flow" in motion.terms,
+        used_flow=Term.FLOW in motion.terms,
         memory=learned(setup, state, frame, estimate),
     )
     T_world_cam = estimate.T_world_cam

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import nn
 
-from hybridvo.core.results import RelativePose
+from hybridvo.core.results import Motion
 from hybridvo.core.types import FramePair
 from hybridvo.network.prediction import selected_motion, usable_inputs
 from hybridvo.network.threads import single_threaded_inference
@@ -12,7 +12,7 @@ from hybridvo.network.threads import single_threaded_inference
 
 def estimate_by_network(
     pair: FramePair, selection: str, network: nn.Module
-) -> RelativePose:
+) -> Motion:
     """Estimate the camera motion of a pair by a network alone.
 
     Args:

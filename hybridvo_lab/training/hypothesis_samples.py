@@ -194,9 +194,9 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
     if static.any():
         start = drawn.T_curr_prev[:3]
         cutoff = Options().refine.cutoff
-        pose, _ = fit_in_mask(
+        pose = fit_in_mask(
             found.grid.samples, static, found.grid.K, start, cutoff
-        )
+        ).pose
         K = drawn.pair.prev.camera.K
         flow, truth = (
             camera_flow(K, drawn.depth, T)[0] for T in (pose, drawn.T_curr_prev)
@@ -205,7 +205,7 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
         error *= REFERENCE_WIDTH / drawn.depth.shape[1]
         limit = allowed_error_px(float(np.nan_to_num(error)))
     count = min(len(found.motions), MAX_MOTIONS)
-    noise = np.array([motion.stats.noise for motion in found.motions[:count]])
+    noise = np.array([motion.noise for motion in found.motions[:count]])
     empty = (0, MAX_MOTIONS - count)
     return vars(grid_maps(found)) | {
         "depth_true": np.minimum(drawn.depth[pick], 6e4).astype(np.float16),

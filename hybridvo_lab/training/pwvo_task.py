@@ -273,12 +273,10 @@ def refits_of(
             if weights.max() <= 0:
                 continue
             K = inputs.K[b].numpy()
-            pose, stats = fit_in_mask(
-                batch.samples[b], weights, K, starts[k], cutoff
-            )
-            if np.isfinite(pose).all():
-                poses.append(pose)
-                noise.append(stats.noise)
+            refit = fit_in_mask(batch.samples[b], weights, K, starts[k], cutoff)
+            if np.isfinite(refit.pose).all():
+                poses.append(refit.pose)
+                noise.append(refit.noise)
                 parents.append(k)
     if not poses:
         return None

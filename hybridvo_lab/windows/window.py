@@ -78,12 +78,9 @@ def refine_window(
     check_kind("refine_window.options", options, Options)
     check_kind("refine_window.batch", batch, PairBatch)
     # not before: they need the extra ``train``
+    from hybridvo.batches import refine_batch
     from hybridvo.solver.torch import factors
-    from hybridvo.solver.torch.backend import (
-        given_noise,
-        kernel_model,
-        refine_batch,
-    )
+    from hybridvo.solver.torch.backend import given_noise, kernel_model
     from hybridvo_lab.windows.window_solver import Window, checked_edges
     from hybridvo_lab.windows.window_unknowns import checked_unknowns
 

@@ -265,8 +265,8 @@ test_batches = refuses(
            ("refine_batch", "T_init", "expected", "got")) for name, v in BAD_STARTS.items()),
         *((f"weights {name}", lambda v=v: hvo.refine(BATCH, EYES, v), InputError,
            ("refine_batch", "weights", "expected", "got")) for name, v in BAD_WEIGHTS.items()),
-        *((f"lead {name}", lambda v=v: hvo.refine(BATCH, hvo.PoseSeed(EYES, ONES, v)), InputError,
-           ("refine_batch", "lead", "expected", "got"))
+        *((f"evidence {name}", lambda v=v: hvo.refine(BATCH, hvo.PoseSeed(EYES, ONES, v)),
+           InputError, ("refine_batch", "evidence", "expected", "got"))
           for name, v in {"text": "x", "of three": torch.ones(3), "one": 1.0}.items()),
         *((f"noise {name}", lambda v=v: hvo.refine(BATCH, noise=v), InputError,
            ("refine_batch", "noise", "expected", "got"))
@@ -278,7 +278,7 @@ test_batches = refuses(
            ("select", "PixelwisePrediction", type(v).__name__)) for v in (None, BATCH, "x")),
         *((f"maps, {name} {what}", lambda n=name, v=v: hvo.select(replace(MAPS, **{n: v})),
            InputError, (f"select.maps.{name}", "expected", "got"))
-          for name in ("motion", "log_scale", "lead", "image_size")
+          for name in ("motion", "log_scale", "evidence", "image_size")
           for what, v in {"text": "x", "number": 3, "array": np.zeros(2), "rows": ONES,
                           "sparse": ONES.to_sparse(), "tuple": (0, 0)}.items()),
         ("options of no network", lambda: hvo.PWVO("pwvo"), InputError,

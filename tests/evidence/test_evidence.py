@@ -39,12 +39,11 @@ class Recorder:
 
     def __call__(
         self, evidence: PairEvidence, ctx: pipeline.Context
-    ) -> Iterator[pipeline.Found]:
+    ) -> Iterator[RelativePose]:
         self.priors.append(evidence.expected)
         pair = evidence.pair
         frames = pair.curr.index - pair.prev.index
-        motion = RelativePose(np.linalg.matrix_power(self.motion, frames))
-        yield pipeline.Found(motion, pair)
+        yield RelativePose(np.linalg.matrix_power(self.motion, frames))
 
 
 def priors_of(

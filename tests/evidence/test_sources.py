@@ -12,7 +12,7 @@ from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.pipeline import Context, Found, by_first_source, first_sure
+from hybridvo.pipeline import Context, by_first_source, first_sure
 from hybridvo.tracking.odometry import Odometry
 from hybridvo_lab.synthetic.scenes import make_scene
 
@@ -31,7 +31,7 @@ class Asked:
 
     def __call__(
         self, evidence: PairEvidence, ctx: Context
-    ) -> Iterator[Found | None]:
+    ) -> Iterator[RelativePose | None]:
         for source in SOURCES:
             call = (evidence.pair.prev.index, source)
             self.calls.append(call)
@@ -41,7 +41,7 @@ class Asked:
             is_sure = self.sure is None or call == self.sure
             status = Status() if is_sure else DOUBTFUL
             motion = RelativePose(STEP, status=status, probability=0.5)
-            yield Found(motion, evidence.pair)
+            yield motion
 
 
 @pytest.fixture
@@ -103,25 +103,25 @@ def test_what_a_later_source_says_replaces_what_an_earlier_one_said(
     surer = RelativePose(STEP, status=DOUBTFUL, probability=0.8)
     last = RelativePose(np.eye(4), status=DOUBTFUL, probability=0.3)
 
-    def method(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
-        yield Found(surer, evidence.pair)
-        yield Found(last, evidence.pair)
+    def method(evidence: PairEvidence, ctx: Context) -> Iterator[RelativePose]:
+        yield surer
+        yield last
 
     monkeypatch.setitem(pipeline.METHODS, "identity", pipeline.Method(method))
-    answer = first_sure([evidence_of_a_pair()], "identity", Context())
-    assert answer.motion.probability == 0.3
+    _, motion = first_sure([evidence_of_a_pair()], "identity", Context())
+    assert motion.probability == 0.3
 
 
 def test_a_stage_that_fails_becomes_a_status(monkeypatch: pytest.MonkeyPatch):
-    def method(evidence: PairEvidence, ctx: Context) -> Iterator[Found]:
+    def method(evidence: PairEvidence, ctx: Context) -> Iterator[RelativePose]:
         raise StageFailed(Reason.NO_FLOW, "by hand")
         yield
 
     monkeypatch.setitem(pipeline.METHODS, "identity", pipeline.Method(method))
-    answer = first_sure([evidence_of_a_pair()], "identity", Context())
-    assert not answer.motion.usable
-    assert answer.motion.status.reason is Reason.NO_FLOW
-    assert answer.motion.method == "identity"
+    _, motion = first_sure([evidence_of_a_pair()], "identity", Context())
+    assert not motion.usable
+    assert motion.status.reason is Reason.NO_FLOW
+    assert motion.method == "identity"
 
 
 @pytest.mark.parametrize("nothing", [(), ("images",)])

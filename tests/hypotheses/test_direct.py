@@ -11,12 +11,14 @@ from hybridvo.api import estimate
 from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.geometry import pose_matrix, project
 from hybridvo.core.options import DirectOptions, Options
-from hybridvo.core.results import Reason
+from hybridvo.core.results import Reason, RelativePose
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import reduced
 from hybridvo.flow.providers import FlowField, dis_flow, with_flow
-from hybridvo.hypotheses.direct import direct_start
-from hybridvo.pipeline import Context, run_method
+from hybridvo.hypotheses.direct import align_images
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.judge.verdict import believed
+from hybridvo.pipeline import Context, run_method, sure_alignment
 from tests.solver.test_photometric import error_px, made_pair
 
 SIZE = {"height": 240, "width": 320}
@@ -47,10 +49,20 @@ def test_a_reduced_camera_sees_a_point_where_the_pixels_are_averaged(static):
     np.testing.assert_allclose(fine, (large - 1.5) / 4, atol=1e-12)
 
 
+def direct(
+    pair: FramePair,
+    T_start: np.ndarray | None = None,
+    least: float = DIRECT_PROBABILITY,
+) -> RelativePose | None:
+    """The motion by images and depth maps alone, where it is so probable."""
+    motion = sure_alignment(align_images(pair, T_start), least)
+    return None if motion is None else believed(motion)
+
+
 def test_static_scene_needs_no_flow(static):
     pair, T = static
     assert error_px(pair, np.eye(4), T) > 1.0
-    found = direct_start(pair)
+    found = direct(pair)
     assert error_px(pair, found.T_curr_prev, T) < 0.05
     assert found.probability > 0.9 and found.inlier_ratio > 0.85
     assert np.linalg.eigvalsh(found.covariance)[0] > 0
@@ -58,7 +70,7 @@ def test_static_scene_needs_no_flow(static):
 
 
 def test_where_most_moves_it_is_not_sure(moving):
-    assert direct_start(moving[0]) is None
+    assert direct(moving[0]) is None
 
 
 @pytest.mark.parametrize("seed", [901, 903])
@@ -67,9 +79,7 @@ def test_a_start_on_a_moving_object_is_no_answer(seed):
     found = next(Context(flow=dis_flow()).evidence(pair).flows()).motions
     assert len(found.poses) > 1
     for pose in found.poses:
-        answer = direct_start(
-            FramePair(pair.prev, pair.curr, None), pose_matrix(pose)
-        )
+        answer = direct(FramePair(pair.prev, pair.curr, None), pose_matrix(pose))
         assert (
             answer is None
             or answer.probability < MIN_PROBABILITY
@@ -87,15 +97,15 @@ def test_a_smooth_thing_that_moves_is_seen_by_its_outline_and_depth(seed):
         place = np.s_[32:208, left : left + 176]
         rgb[place], depth[place] = 180, 1.2
         frames.append(replace(frame, rgb=rgb, depth=depth))
-    found = direct_start(FramePair(*frames, None), min_probability=0.0)
+    found = direct(FramePair(*frames, None), least=0.0)
     assert error_px(pair, found.T_curr_prev, T) > 1.0 and found.probability < 0.5
 
 
 def test_a_start_leads_over_a_motion_that_is_too_far():
     pair, T, _ = made_pair("static", 305, **SIZE)
     far = replace(pair.curr, rgb=np.roll(pair.curr.rgb, 90, axis=1))
-    assert direct_start(FramePair(pair.prev, far, None)) is None
-    found = direct_start(FramePair(pair.prev, pair.curr, None), T)
+    assert direct(FramePair(pair.prev, far, None)) is None
+    found = direct(FramePair(pair.prev, pair.curr, None), T)
     assert error_px(pair, found.T_curr_prev, T) < 0.05
 
 
@@ -142,7 +152,7 @@ def test_masked_pixels_are_not_looked_at(static):
     seen = replace(
         pair, prev=replace(pair.prev, mask=mask), curr=replace(curr, mask=mask)
     )
-    wrong, motion = direct_start(replace(pair, curr=curr)), direct_start(seen)
+    wrong, motion = direct(replace(pair, curr=curr)), direct(seen)
     assert wrong is None or error_px(pair, wrong.T_curr_prev, T) > 0.5
     assert error_px(pair, motion.T_curr_prev, T) < 0.2
 

@@ -8,17 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridvo.core.options import RefineOptions
-from hybridvo.core.results import PhotometricReport, RelativePose
+from hybridvo.core.results import Motion, PhotometricReport
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.hypotheses.direct import direct_start
+from hybridvo.hypotheses.direct import align_images
 from hybridvo.hypotheses.direct_evidence import (
-    PointResiduals,
-    compare_points,
-    shift_of_regions,
+    SeenPoints,
+    direct_evidence,
+    see_points,
     weighted_median,
 )
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
-from hybridvo.judge.choice import direct_evidence, direct_probability
+from hybridvo.judge.probability import direct_probability
+from hybridvo.pipeline import sure_alignment
 from hybridvo.solver.planes import PlaneFactor
 from hybridvo_lab.synthetic.slow_scenes import (
     noisy_image,
@@ -28,8 +29,9 @@ from hybridvo_lab.synthetic.slow_scenes import (
 
 SIZE = (240, 320)
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, *SIZE)
-NO_MOTION = RelativePose(photometric=PhotometricReport(gain=1.0))
+NO_MOTION = Motion(photometric=PhotometricReport(gain=1.0))
 NOISE = 2.0
+CUTOFF = RefineOptions().cutoff
 
 
 def waves(shift_px: float) -> np.ndarray:
@@ -46,7 +48,7 @@ def frame(grey: np.ndarray, seed: int) -> Frame:
     return Frame(rgb, np.full(SIZE, 2.0, np.float32), CAMERA)
 
 
-def seen(left_px: float, right_px: float) -> tuple[PointResiduals, PlaneFactor]:
+def seen(left_px: float, right_px: float) -> SeenPoints:
     """What no motion shows where the halves of a view moved so far."""
     grey = waves(left_px)
     grey[:, SIZE[1] // 2 :] = waves(right_px)[:, SIZE[1] // 2 :]
@@ -54,25 +56,25 @@ def seen(left_px: float, right_px: float) -> tuple[PointResiduals, PlaneFactor]:
     ones = np.ones(SIZE, np.float32)
     planes = PlaneFactor(pair, ones, 0.0, RefineOptions())
     at = planes.at(np.eye(4))
-    return compare_points(pair, planes, at, NO_MOTION), planes
+    return see_points(pair, planes, at, NO_MOTION, CUTOFF)
 
 
 def test_of_a_right_motion_regions_stay_within_the_noise() -> None:
-    assert shift_of_regions(*seen(0.0, 0.0)) < 1.5
+    assert seen(0.0, 0.0).shift_of_regions() < 1.5
 
 
 @pytest.mark.parametrize("shift_px", [0.2, 0.4])
 def test_regions_show_a_shift_that_no_point_shows(shift_px: float) -> None:
     """Each point would lie within a grey level of the noise; the regions lie far outside."""
-    between_two = shift_of_regions(*seen(-shift_px, shift_px))
-    assert between_two > 2 * shift_of_regions(*seen(0.0, 0.0))
+    between_two = seen(-shift_px, shift_px).shift_of_regions()
+    assert between_two > 2 * seen(0.0, 0.0).shift_of_regions()
 
 
 def test_only_regions_that_count_as_static_are_asked() -> None:
-    images, planes = seen(0.0, 0.5)
-    is_left = planes.index[:, 1] < SIZE[1] // 2 - 40
-    of_left = shift_of_regions(images, planes, is_left.astype(float))
-    of_right = shift_of_regions(images, planes, 1.0 - is_left)
+    points = seen(0.0, 0.5)
+    is_left = points.planes.index[:, 1] < SIZE[1] // 2 - 40
+    of_left = points.shift_of_regions(is_left.astype(float))
+    of_right = points.shift_of_regions(1.0 - is_left)
     assert of_left < 1.5 and of_right > 3 * of_left
 
 
@@ -82,10 +84,10 @@ def test_a_view_without_texture_shows_no_shift() -> None:
     )
     planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 0.0, RefineOptions())
     at = planes.at(np.eye(4))
-    images = compare_points(pair, planes, at, NO_MOTION)
-    outside = images._replace(inside=np.zeros_like(images.inside))
-    assert shift_of_regions(outside, planes) == 0.0
-    assert np.isfinite(shift_of_regions(images, planes))
+    points = see_points(pair, planes, at, NO_MOTION, CUTOFF)
+    outside = points._replace(inside=np.zeros_like(points.inside))
+    assert outside.shift_of_regions() == 0.0
+    assert np.isfinite(points.shift_of_regions())
 
 
 @given(
@@ -146,5 +148,7 @@ def test_a_motion_between_those_of_the_scene_and_of_things_is_not_sure(
 ) -> None:
     """Of neighbouring frames every point seems to follow it: things are half a pixel away."""
     (before, _), (after, _) = video(kind, seed, 2)
-    found = direct_start(FramePair(before, after, None), min_probability=0.0)
-    assert found is not None and found.probability < DIRECT_PROBABILITY
+    rough = align_images(FramePair(before, after, None))
+    found = sure_alignment(rough, 0.0)
+    assert found is not None
+    assert direct_probability(found.evidence) < DIRECT_PROBABILITY

@@ -93,7 +93,7 @@ def test_the_ranking_follows_the_memory(found: HypothesisSet) -> None:
     """A scorer that is in favour of what most pixels follow, by two nats."""
 
     def scorer(candidates, refits):
-        ratios = [candidate.stats.inlier_ratio for candidate in candidates]
+        ratios = [candidate.inlier_ratio for candidate in candidates]
         return Scores(2.0 * (np.array(ratios) == max(ratios)), {})
 
     options = Options()

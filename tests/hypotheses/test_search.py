@@ -16,7 +16,7 @@ from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.proposals import draw_three
 from hybridvo.hypotheses.search import distances, find_motions
 from hybridvo.hypotheses.select import search_candidates, to_hypotheses
-from hybridvo.hypotheses.types import HypothesisSet, Motion, MotionSource
+from hybridvo.hypotheses.types import Candidate, HypothesisSet, MotionSource
 from hybridvo.solver.pixels import PixelGrid
 
 IDENTITY = np.eye(4)[None]
@@ -60,7 +60,7 @@ def by_opencv(pair: FramePair, columns: slice) -> np.ndarray:
 
 def motions_of(
     pair: FramePair, starts: np.ndarray = IDENTITY, **options: object
-) -> tuple[Motion, ...]:
+) -> tuple[Candidate, ...]:
     tree = Options(search=SearchOptions(**options))
     return find_motions(PixelGrid(pair, None), starts[:, :3], tree, 0)
 
@@ -78,13 +78,13 @@ def test_two_motions_are_those_that_opencv_finds_in_their_parts() -> None:
 def test_statistics_are_those_of_the_pair() -> None:
     world, moving, *_ = motions_of(pair_of_two_motions())
     # 55 of 160 columns move
-    assert world.stats.inlier_ratio == pytest.approx(105 / 160, abs=0.05)
-    assert moving.stats.inlier_ratio == pytest.approx(55 / 160, abs=0.05)
+    assert world.inlier_ratio == pytest.approx(105 / 160, abs=0.05)
+    assert moving.inlier_ratio == pytest.approx(55 / 160, abs=0.05)
     for motion in (world, moving):
         # 0.1 px of noise, and what inliers of the other motion add
-        assert motion.stats.flow_noise_px == pytest.approx(0.1, abs=0.03)
-        assert motion.stats.iterations > 0
-        assert motion.stats.source is not MotionSource.RUNNER_UP
+        assert motion.flow_noise_px == pytest.approx(0.1, abs=0.03)
+        assert motion.iterations > 0
+        assert motion.source is not MotionSource.RUNNER_UP
 
 
 def test_a_start_competes_with_the_motions_of_the_pixels() -> None:
@@ -103,7 +103,7 @@ def test_one_motion_of_all_pixels_ends_the_search() -> None:
     flow = ego_flow(pair.prev.depth, WORLD, CAMERA, CAMERA).astype(np.float32)
     motions = motions_of(replace(pair, flow=flow))
     assert len(motions) == 1
-    assert motions[0].stats.inlier_ratio > 0.95
+    assert motions[0].inlier_ratio > 0.95
 
 
 def test_few_pixels_beside_a_motion_of_nearly_all_show_another_one() -> None:
@@ -113,7 +113,7 @@ def test_few_pixels_beside_a_motion_of_nearly_all_show_another_one() -> None:
     flow = ego_flow(pair.prev.depth, WORLD, CAMERA, CAMERA)
     flow[:, 20:] = moved[:, 20:]
     first, second, *_ = motions_of(replace(pair, flow=flow.astype(np.float32)))
-    assert first.stats.inlier_ratio > 0.85
+    assert first.inlier_ratio > 0.85
     # without noise, to single precision and what other pixels pull
     for motion, T in ((first, OBJECT), (second, WORLD)):
         assert np.abs(se3_log(pose_matrix(motion.pose) @ invert(T))).max() < 5e-3
@@ -123,7 +123,7 @@ def test_weak_motions_are_left_out() -> None:
     # the object has a third of the pixels
     motions = motions_of(pair_of_two_motions(), min_inlier_ratio=0.5)
     assert len(motions) == 1
-    assert motions[0].stats.inlier_ratio > 0.5
+    assert motions[0].inlier_ratio > 0.5
 
 
 def test_inliers_follow_the_option_of_the_cutoff() -> None:

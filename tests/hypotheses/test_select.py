@@ -26,7 +26,8 @@ from hybridvo.hypotheses.select import (
     select_from,
 )
 from hybridvo.hypotheses.types import HypothesisSet
-from hybridvo.judge.choice import choice_probability
+from hybridvo.judge.probability import choice_probability
+from hybridvo.judge.verdict import believed
 from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 
@@ -92,7 +93,7 @@ def fitted(
     """A selected motion, refined inside its mask."""
     options = Options()
     grid = static_grid(found, pair, chosen.mask, None, options.refine)
-    return refine_pair(pair, chosen, grid, None, None, MIN_PROBABILITY)
+    return believed(refine_pair(pair, chosen, grid), MIN_PROBABILITY)
 
 
 def static_mask(case) -> np.ndarray:
@@ -152,10 +153,11 @@ def test_a_small_gap_is_degraded_with_its_probability_and_a_wide_covariance(
         )
         for margin in (5.0, 0.01)
     )
-    assert chosen.probability < MIN_PROBABILITY < sure.probability
+    probability = choice_probability(chosen.evidence)
+    assert probability < MIN_PROBABILITY < choice_probability(sure.evidence)
     answer = fitted(found, pair, chosen)
     assert answer.status.state is State.DEGRADED and not answer.ok and answer.usable
-    assert answer.probability == chosen.probability
+    assert answer.probability == probability
 
 
 def test_what_one_flow_shows_stays_a_rival_in_the_next(case) -> None:

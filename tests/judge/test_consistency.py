@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from scipy.stats import chi2
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Reason, RelativePose
+from hybridvo.evidence.pair import PairEvidence
 from hybridvo.judge.consistency import (
     against_images_and_depth,
     contradiction_by_depth,
 )
-from hybridvo.judge.findings import Finding, Question
+from hybridvo.judge.findings import Finding
 from hybridvo_lab.synthetic.scenes import make_scene
 
 METHODS = ["hybrid", "hybrid-flow", "classical", "pwvo-refine"]
@@ -150,7 +152,9 @@ def test_a_tracker_goes_on_asking_the_images(walk: list[hvo.Frame]) -> None:
 def by_images(pair: hvo.FramePair, motion: RelativePose) -> Finding | None:
     """What the images state against a motion on flow of another origin."""
     without_depth = replace(pair, curr=replace(pair.curr, depth=None))
-    return against_images_and_depth(Question(without_depth, motion, "given"))
+    given = SimpleNamespace(source="given")
+    evidence = PairEvidence(without_depth, provider=given)
+    return against_images_and_depth(evidence, motion)
 
 
 def test_leads_are_none_without_what_they_need(walk: list[hvo.Frame]) -> None:

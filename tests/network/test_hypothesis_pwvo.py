@@ -71,7 +71,7 @@ def inputs_of(seed: int) -> HypothesisInputs:
 
 def asked(found: HypothesisSet) -> HypothesisInputs:
     image = hypothesis_inputs(grid_maps(found), None, torch.device("cpu"))
-    noise = np.array([motion.stats.noise for motion in found.motions])
+    noise = np.array([motion.noise for motion in found.motions])
     return image.with_hypotheses(found.poses, noise, np.arange(len(noise)))
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.special import logit
 
 from hybridvo.api import refine
 from hybridvo.core.errors import InputError
@@ -14,6 +15,8 @@ from hybridvo.core.options import Options, SelectOptions
 from hybridvo.core.results import MotionPrior, StageFailed
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.hypotheses.generate import generate
+from hybridvo.hypotheses.select import ChoiceEvidence
+from hybridvo.judge.probability import choice_probability
 from hybridvo.network.pair_maps import look_at_pair, predict_pairs
 from hybridvo.network.pwvo import PWVO
 from hybridvo.network.selection import INVALID_LOG_SCALE, select
@@ -23,7 +26,7 @@ from tests import worlds
 SCENARIO = Scenario(moving=0.6, objects=1, flow_noise_px=0.3, depth_noise=0.01)
 SIZE = (96, 224)
 SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
-MAPS = ("motion", "log_scale", "lead")
+MAPS = ("motion", "log_scale", "evidence")
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +61,7 @@ def test_a_pair_and_a_batch_of_it_give_the_same(network, pairs) -> None:
                 torch.testing.assert_close(some, getattr(alone, name))
             assert alone.image_size == together.image_size == SIZE
     count, channels, h, w = together.motion.shape
-    assert (count, channels) == (2, 6) and together.lead.shape == (2,)
+    assert (count, channels) == (2, 6) and together.evidence.shape == (2, 4)
     # the grid of the search
     stride = round(SIZE[0] / h)
     assert (h, w) == (SIZE[0] // stride, SIZE[1] // stride)
@@ -71,7 +74,7 @@ def test_the_maps_are_those_of_the_surest_hypothesis(network, pairs) -> None:
         again = network.maps(network.look(look.inputs))
     assert look is not None and len(look.inputs.owner) == 1
     torch.testing.assert_close(look.prediction.motion, maps.motion)
-    torch.testing.assert_close(look.prediction.lead, maps.lead)
+    torch.testing.assert_close(look.prediction.evidence, maps.evidence)
     # the hypothesis alone has no rivals: its maps are near, not the same
     assert again.motion.shape == maps.motion.shape
     # a pixel without flow or depth says nothing
@@ -94,9 +97,10 @@ def test_a_pair_without_data_is_uncertain_and_changes_no_other(
         maps = network(batch)
         alone = network(pairs[0])
     for name in MAPS:
-        assert torch.isfinite(getattr(maps, name)).all(), name
+        if name != "evidence":
+            assert torch.isfinite(getattr(maps, name)).all(), name
         torch.testing.assert_close(getattr(maps, name)[:1], getattr(alone, name))
-    assert (maps.motion[1] == 0).all() and maps.lead[1] == 0
+    assert (maps.motion[1] == 0).all() and maps.evidence[1].isnan().all()
     assert (maps.log_scale[1] >= INVALID_LOG_SCALE).all()
     seed = select(maps)
     assert torch.isfinite(seed.T_curr_prev).all()
@@ -132,7 +136,11 @@ def test_a_prior_is_looked_at(network, known) -> None:
     torch.testing.assert_close(both.log_scale[1:], look.prediction.log_scale)
     assert not torch.equal(both.log_scale[1], plain.log_scale[1])
     # what is expected to be true makes no other motion surer
-    assert float(both.lead[1]) > float(plain.lead[1]) - 0.5
+    without, beside = (
+        choice_probability(ChoiceEvidence(*maps.evidence[1].tolist()))
+        for maps in (plain, both)
+    )
+    assert logit(beside) > logit(without) - 0.5
 
 
 def test_options_and_seed_are_those_of_the_search(network, pairs) -> None:

@@ -8,9 +8,10 @@ import torch
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow, rotation_angle, se3_exp
-from hybridvo.core.options import Options, SelectOptions
+from hybridvo.core.options import Options
 from hybridvo.core.results import PixelwisePrediction, Reason, StageFailed, State
 from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.judge.verdict import believed
 from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.prediction import estimate_by_pwvo
 from hybridvo.network.pwvo import PWVO, PWVOOptions
@@ -87,15 +88,15 @@ def test_a_network_is_an_estimator(kind):
 def test_pwvo_alone_is_an_estimator(moving_pair):
     pair, _ = moving_pair
     network = PWVO.from_pretrained()
-    result = estimate_by_pwvo(pair, network, None, Options(), 0)
+    motion = estimate_by_pwvo(pair, network, None, Options(), 0)
+    result = believed(motion)
     assert result.usable and 0 <= result.probability <= 1
     assert np.linalg.eigvalsh(result.covariance)[0] > 0
     with torch.inference_mode():
         expected = select_motion(network(pair))[0]
     np.testing.assert_allclose(result.T_curr_prev, expected.numpy(), atol=1e-4)
     # the covariance is stated whatever probability is wanted; the status is not
-    strict = Options(select=SelectOptions(min_probability=1.0))
-    unsure = estimate_by_pwvo(pair, network, None, strict, 0)
+    unsure = believed(motion, min_probability=1.0)
     np.testing.assert_array_equal(unsure.covariance, result.covariance)
     assert unsure.status.state is State.DEGRADED
 

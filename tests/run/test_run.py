@@ -19,7 +19,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core.results import RelativePose
 from hybridvo.core.trajectory import read_trajectory
-from hybridvo.pipeline import METHODS, Found, Method
+from hybridvo.pipeline import METHODS, Method
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run_folder import CHECKPOINT, STATE
 from hybridvo_lab.synthetic.scenes import make_scene
@@ -356,7 +356,7 @@ def test_a_motion_of_probability_0_is_never_followed(
     motion = RelativePose(T, 1e-6 * np.eye(6), probability=0.0)
 
     def certain_to_be_wrong(evidence, ctx):
-        yield Found(motion, evidence.pair)
+        yield motion
 
     monkeypatch.setitem(METHODS, "classical", Method(certain_to_be_wrong))
     assert run(dataset, tmp_path, "--flow", "dis", "--max-failed", "1") == 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.batches import refine_batch
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Reason, State
 from hybridvo.core.torch_geometry import se3
@@ -19,7 +20,6 @@ from hybridvo.solver.noise_estimation import Noise
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.status import FitSummary, status_of
 from hybridvo.solver.torch import factors
-from hybridvo.solver.torch.backend import refine_batch
 from tests import worlds
 
 NOISE = Noise(0.3, 0.02)
@@ -119,7 +119,7 @@ JUDGED = {
 @pytest.mark.parametrize("case", JUDGED)
 def test_the_status_follows_from_the_fit(case: str) -> None:
     changed, state, reason = JUDGED[case]
-    status = status_of(RIGHT._replace(**changed), None, 0.9, 0.5)
+    status = status_of(RIGHT._replace(**changed), None)
     assert (status.state, status.reason) == (state, reason)
 
 

@@ -70,7 +70,7 @@ def test_gradients_reach_flow_depth_weights_and_maps(pairs) -> None:
         maps,
         motion=maps.motion.double(),
         log_scale=maps.log_scale.double(),
-        lead=maps.lead.double(),
+        evidence=maps.evidence.double(),
     )
     C = torch.randn(
         4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
@@ -165,7 +165,9 @@ def test_the_probability_is_calibrated_by_what_calibration_says(pairs) -> None:
     # nothing agrees with a motion so little that the network is no surer of it than of another
     batch = hvo.PairBatch.from_pairs([pairs[0][0]])
     seed = hvo.select(hvo.PWVO.from_pretrained()(batch))
-    unsure = hvo.refine(batch, seed._replace(lead=torch.zeros(1)))
+    unsure = hvo.refine(
+        batch, seed._replace(evidence=torch.full((1, 4), torch.nan))
+    )
     assert float(unsure.probability[0]) < 0.75
     assert unsure.status[0].reason is hvo.Reason.AMBIGUOUS_MOTION
 

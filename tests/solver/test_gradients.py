@@ -9,11 +9,11 @@ import pytest
 import torch
 
 import hybridvo as hvo
+from hybridvo.batches import refine_batch
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.torch_geometry import left_update, pixel_grid, pp, reproject
 from hybridvo.core.types import PairBatch
-from hybridvo.solver.torch.backend import refine_batch
 from hybridvo.solver.torch.factors import (
     KERNELS,
     ResidualModel,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from hybridvo.batches import refine_batch
 from hybridvo.core.geometry import ego_flow, ego_flow_error, se3_exp
 from hybridvo.core.torch_geometry import se3
 from hybridvo.core.types import FramePair, PairBatch
 from hybridvo.solver.torch import factors
-from hybridvo.solver.torch.backend import refine_batch
 from hybridvo.solver.torch.tools import PoseSeed
 from tests import worlds
 

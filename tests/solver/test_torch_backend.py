@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from hybridvo.api import refine
+from hybridvo.batches import refine_batch
 from hybridvo.core.geometry import (
     ego_flow,
     invert,
@@ -21,7 +22,7 @@ from hybridvo.core.results import Reason, State
 from hybridvo.core.torch_geometry import pixel_grid, reproject, se3
 from hybridvo.core.types import PairBatch
 from hybridvo.solver.covariance import MotionCovariance
-from hybridvo.solver.torch.backend import BatchedPose, refine_batch
+from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.covariance import checked
 from hybridvo.solver.torch.factors import KERNELS
 from hybridvo_lab.synthetic.noise_scenarios import make_pair

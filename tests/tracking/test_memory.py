@@ -18,7 +18,10 @@ from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.types import FramePair
-from hybridvo.hypotheses.direct import direct_start
+from hybridvo.hypotheses.direct import align_images
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.judge.probability import probability_of
+from hybridvo.pipeline import sure_alignment
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
@@ -240,7 +243,7 @@ def test_the_images_alone_are_enough_on_what_is_static() -> None:
     """A box on half of the view moves: not sure alone, sure with a memory."""
     before = view(box=0, index=0, region=LARGE_BOX)
     pair = FramePair(before, view(box=8, index=1, region=LARGE_BOX), None)
-    alone = direct_start(pair, min_probability=0.0)
+    alone = sure_alignment(align_images(pair), 0.0)
     assert alone is not None
     log_odds = np.full(grid_index(SIZE).shape[:2], 3.0, np.float16)
     moves = np.zeros(SIZE, bool)
@@ -248,8 +251,8 @@ def test_the_images_alone_are_enough_on_what_is_static() -> None:
     index = grid_index(SIZE)
     log_odds[moves[index[..., 0], index[..., 1]]] = -3.0
     belief = Belief(log_odds, 7.0)
-    known = direct_start(pair, belief=belief)
-    assert alone.probability < MIN_PROBABILITY
+    known = sure_alignment(align_images(pair, belief=belief), DIRECT_PROBABILITY)
+    assert probability_of(alone.evidence) < MIN_PROBABILITY
     assert known is not None and "memory" in known.terms
     # what is believed to move has no weight
     assert known.weights[60, 80] == 0 and known.weights[5, 20] == 1
@@ -262,7 +265,8 @@ def test_a_motion_that_hides_most_of_what_is_known_is_refused() -> None:
     covered.rgb[10:-10, 10:-10] = texture(7)[10:-10, 10:-10]
     known = np.full(grid_index(SIZE).shape[:2], 3.0, np.float16)
     pair = FramePair(view(), covered, None)
-    assert direct_start(pair, belief=Belief(known, 7.0)) is None
+    rough = align_images(pair, belief=Belief(known, 7.0))
+    assert sure_alignment(rough, DIRECT_PROBABILITY) is None
 
 
 @pytest.mark.parametrize("mode", ["auto", "off"])

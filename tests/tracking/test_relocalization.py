@@ -146,11 +146,7 @@ def test_no_costly_source_begins_after_the_time_is_over(frames, monkeypatch):
     def never(evidence, ctx):
         for source in ("images", "flow", "depth", "matches", "more matches"):
             tried.append(source)
-            yield (
-                None
-                if source == "images"
-                else pipeline.Found(nothing, evidence.pair)
-            )
+            yield None if source == "images" else nothing
 
     nothing = hvo.RelativePose.failed(hvo.Reason.AMBIGUOUS_MOTION, "")
     monkeypatch.setitem(

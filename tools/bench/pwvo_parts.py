@@ -54,7 +54,7 @@ class Looked(NamedTuple):
     batch: PairBatch
     hypothesis: torch.Tensor  # (1, 4, 4)
     weights: torch.Tensor  # (1, H, W) P(static), over its largest
-    lead: torch.Tensor  # (1,)
+    evidence: torch.Tensor  # (1, 4) what speaks for the motion
     patches: PatchPoses
     # as if every pixel were as surely static
     unselected: PatchPoses
@@ -202,7 +202,7 @@ def errors_of(
     for name, start_of in ROWS.items():
         start = start_of(pair)
         seed = PoseSeed(
-            start.T_curr_prev, start.weights, pair.lead, start.covariance
+            start.T_curr_prev, start.weights, pair.evidence, start.covariance
         )
         motion = refine(pair.batch, seed)
         starts[name] = error(start.T_curr_prev[0])
@@ -224,14 +224,14 @@ def looked(known: KnownPair, look: PairLook) -> Looked:
     """What PWVO states of a pair by its look."""
     batch = PairBatch.from_pairs([known.pair])
     hypothesis = torch.from_numpy(pose_matrix(look.hypothesis.pose))[None]
-    noise = torch.tensor([list(look.hypothesis.stats.noise)])
+    noise = torch.tensor([list(look.hypothesis.noise)])
     weights = seed_weights(look.prediction)
-    assert look.prediction.lead is not None
+    assert look.prediction.evidence is not None
     return Looked(
         batch=batch,
         hypothesis=hypothesis,
         weights=weights,
-        lead=look.prediction.lead,
+        evidence=look.prediction.evidence,
         patches=patch_poses(batch, hypothesis, weights, noise),
         unselected=patch_poses(batch, hypothesis, None, noise),
     )

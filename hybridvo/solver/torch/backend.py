@@ -1,4 +1,4 @@
-"""The refinement of a batch of pairs in torch: CPU or GPU, float32 or float64, differentiable.
+"""The fit of a batch of pairs in torch: CPU or GPU, float32 or float64, differentiable.
 
 The gradient is that of the implicit function theorem: the estimate solves
 g(T, inputs, noise) = 0, so d xi = A^-1 dg with A = -dg / d xi. It is attached by one Newton step
@@ -15,28 +15,21 @@ Samples do not influence each other.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
-from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.checks import brief, check_kind
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.torch_geometry import pp, se3, to_matrix
 from hybridvo.core.types import PairBatch
 from hybridvo.solver.torch import factors
-from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
-from hybridvo.solver.torch.covariance import batch_covariances
+from hybridvo.solver.torch.batched_pose import BatchedPose
+from hybridvo.solver.torch.covariance import BatchCovariance, batch_covariances
 from hybridvo.solver.torch.factors import KERNELS, Pixels, ResidualModel
-from hybridvo.solver.torch.solve import Starts, solve
-from hybridvo.solver.torch.status import StartEvidence, judged_batch
-from hybridvo.solver.torch.tools import (
-    PoseSeed,
-    as_tensor,
-    checked_batch,
-    uncompiled,
-)
+from hybridvo.solver.torch.solve import BatchFit, Starts, solve
+from hybridvo.solver.torch.tools import PoseSeed, as_tensor, checked_batch
 
 # c of the other kernels, standard deviations: 95 % efficient under normal noise (Holland and
 # Welsch, 1977). The one of ``l2`` has no effect.
@@ -46,50 +39,61 @@ KERNEL_CUTOFFS = {"cauchy": 2.385, "huber": 1.345, "l2": 1.0}
 MAX_ENTRY = 1e9
 POSE = (4, 4)
 STARTS_DIMENSIONS = 4  # (B, S, 4, 4)
+EVIDENCE = 4
+"""Numbers that speak for a motion that PWVO chose."""
 
 
-@uncompiled
-def refine_batch(
-    batch: PairBatch,
-    T_init: Any = None,
-    weights: Any = None,
-    *,
-    noise: Any = None,
-    kernel: str = "geman-mcclure",
-    options: RefineOptions | None = None,
-    min_probability: float = MIN_PROBABILITY,
-) -> BatchedPose:
-    """Estimate the camera motion of every pair of a batch by robust dense reprojection.
+class BatchSolution(NamedTuple):
+    """The motions of a batch, and all that they are judged by.
 
-    It computes in the type of flow and depth, at least float32. Gradients reach flow, depth,
-    intrinsics, variances, weights and ``noise``, not ``T_init``: see the module for what is held
-    constant. A sample with bad data fails alone, and its gradient is zero.
-
-    A batch is not searched for other motions. Which one is found follows from the weights; without
-    any, or where all of a sample are alike, its status is at best degraded and its probability NaN.
-
-    Args:
-        batch: see :class:`~hybridvo.core.types.PairBatch`.
-        T_init: a :class:`PoseSeed`; or (B, 4, 4) or (B, S, 4, 4) T_curr_prev to start from, metres;
-            one that is not finite is replaced by the identity. Without weights the identity is one
-            more start. Where the seed states no covariance the motion is sought within about a
-            pixel, or more where hardly any pixel fits it. The identity that stands in for a missing
-            start has none: from there the motion is sought far away.
-        weights: (B, H, W) factors on the information, unless the seed has some; pixels whose factor
-            is not positive and finite are not used. They count squared until the motion is chosen.
-        noise: standard deviations of flow, px, and of log depth, as (2,) or (B, 2); None:
-            estimated, and held constant for the gradient.
-        kernel: ``geman-mcclure``, with the cutoff of the options, ``cauchy``, ``huber`` or ``l2``.
-        options: see :class:`~hybridvo.core.options.RefineOptions`.
-        min_probability: the probability below which a motion is degraded.
-
-    Returns:
-        The motions, with the status of every sample.
-
-    Raises:
-        InputError: A value has another shape, type or device.
+    Attributes:
+        batch: checked.
+        pixels: of the batch, with gradient.
+        fit: the motions.
+        stated: their covariances, and what they rest on.
+        model: the robust kernel, with the noise that was estimated.
+        noise: (B, 2) that was handed in, with its gradient; None: none was.
+        starts: (B, 7) the first of the motions handed in.
+        evidence: (B, 4) what speaks for these, or None.
+        has_preference: (B,) whether the weights prefer some pixels to others.
+        needs_gradient: whether a gradient of the motions is needed.
     """
-    options = RefineOptions() if options is None else options
+
+    batch: PairBatch
+    pixels: Pixels
+    fit: BatchFit
+    stated: BatchCovariance
+    model: ResidualModel
+    noise: torch.Tensor | None
+    starts: pp.LieTensor
+    evidence: torch.Tensor | None
+    has_preference: torch.Tensor
+    needs_gradient: bool
+
+    def with_gradient(self, result: BatchedPose) -> BatchedPose:
+        """Judged motions with the gradient of the solution; a failed one and a seed have none."""
+        if not self.needs_gradient:
+            return result
+        noise = result.noise if self.noise is None else self.noise
+        model = self.model._replace(noise=noise)
+        T = result.SE3.detach()
+        A = factors.newton_matrix(self.pixels, T, model)
+        g = factors.total_score(self.pixels, to_matrix(T), model)
+        wanted = ~(result.failed | self.fit.is_seed)[:, None]
+        return replace(
+            result, SE3=factors.attach_implicit_gradient(T, A, g, wanted)
+        )
+
+
+def solve_batch(
+    batch: PairBatch,
+    T_init: Any,
+    weights: Any,
+    noise: Any,
+    kernel: str,
+    options: RefineOptions,
+) -> BatchSolution:
+    """Fit the motion of every pair of a batch; see :func:`hybridvo.batches.refine_batch`."""
     check_kind("refine_batch.batch", batch, PairBatch)
     check_kind("refine_batch.options", options, RefineOptions)
     model = kernel_model(kernel, options)
@@ -102,29 +106,29 @@ def refine_batch(
     covariance = _given_covariance(seed.covariance, batch.flow)
     starts = Starts(T_starts, is_seed, covariance)
     # it belongs to a start and its weights
-    lead = None if with_identity else seed.lead
+    evidence = None if with_identity else seed.evidence
+    evidence = _given_evidence(evidence, batch.flow)
     noise = given_noise(noise, batch.flow)
-    start_evidence = StartEvidence(
+    has_preference = _has_preference(weights, batch.flow)
+    pixels = factors.gather_pixels(batch, weights)
+    needs_gradient = _needs_gradient(batch, weights, noise)
+    fixed = pixels.map(torch.Tensor.detach)
+    with torch.no_grad():
+        fit = solve(batch, fixed, starts, noise, model, options, needs_gradient)
+        model = model._replace(noise=fit.noise)
+        stated = batch_covariances(batch, fixed, fit, model, options)
+    return BatchSolution(
+        batch,
+        pixels,
+        fit,
+        stated,
+        model,
+        noise,
         T_starts[:, 0],
-        _given_lead(lead, batch.flow),
-        _has_preference(weights, batch.flow),
-        min_probability,
+        evidence,
+        has_preference,
+        needs_gradient,
     )
-    with torch.autocast(batch.flow.device.type, enabled=False):
-        pixels = factors.gather_pixels(batch, weights)
-        needs_gradient = _needs_gradient(batch, weights, noise)
-        fixed = pixels.map(torch.Tensor.detach)
-        with torch.no_grad():
-            fit = solve(batch, fixed, starts, noise, model, options, needs_gradient)
-            model = model._replace(noise=fit.noise)
-            stated = batch_covariances(batch, fixed, fit, model, options)
-            result = judged_batch(
-                batch, fixed, fit, stated, start_evidence, options
-            )
-        if not needs_gradient:
-            return result
-        model = model._replace(noise=result.noise if noise is None else noise)
-        return _with_gradient(result, pixels, model, fit.is_seed)
 
 
 def kernel_model(kernel: Any, options: RefineOptions) -> ResidualModel:
@@ -158,20 +162,6 @@ def _needs_gradient(
     return torch.is_grad_enabled() and any(
         x is not None and x.requires_grad for x in tensors
     )
-
-
-def _with_gradient(
-    result: BatchedPose,
-    pixels: Pixels,
-    model: ResidualModel,
-    is_seed: torch.Tensor,
-) -> BatchedPose:
-    """Return the motions with the gradient of the solution; a failed one and a seed have none."""
-    T = result.SE3.detach()
-    A = factors.newton_matrix(pixels, T, model)
-    g = factors.total_score(pixels, to_matrix(T), model)
-    wanted = ~(result.failed | is_seed)[:, None]
-    return replace(result, SE3=factors.attach_implicit_gradient(T, A, g, wanted))
 
 
 def _initial_poses(
@@ -226,17 +216,18 @@ def _given_covariance(value: Any, like: torch.Tensor) -> torch.Tensor | None:
     return covariance
 
 
-def _given_lead(lead: Any, like: torch.Tensor) -> torch.Tensor | None:
-    """Return the lead (B,) as handed in, or None."""
-    if lead is None:
+def _given_evidence(evidence: Any, like: torch.Tensor) -> torch.Tensor | None:
+    """Return the evidence (B, 4) as handed in, or None."""
+    if evidence is None:
         return None
-    value = as_tensor(lead, "PoseSeed.lead", like.device).detach().double()
-    if value.shape != like.shape[:1]:
-        shape = f"({len(like)},)"
+    value = as_tensor(evidence, "PoseSeed.evidence", like.device).detach().double()
+    expected = (len(like), EVIDENCE)
+    if tuple(value.shape) != expected:
         raise InputError(
-            f"refine_batch: expected PoseSeed.lead of shape {shape}, got {tuple(value.shape)}."
+            f"refine_batch: expected PoseSeed.evidence of shape {expected}, "
+            f"got {tuple(value.shape)}."
         )
-    return torch.nan_to_num(value, 0.0, 0.0, 0.0)
+    return value
 
 
 def _has_preference(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from hybridvo.core.results import RelativePose, Status
+from hybridvo.core.results import RelativePose, Status, Term
 
 if TYPE_CHECKING:
     from hybridvo.core.torch_geometry import pp
@@ -94,5 +94,5 @@ class BatchedPose:
             probability=float(self.probability[index]),
             evidence=evidence,
             method="classical",
-            terms=("flow",),
+            terms=(Term.FLOW,),
         )

@@ -23,22 +23,23 @@ class PoseSeed(NamedTuple):
     Attributes:
         T_curr_prev: (B, 4, 4), metres; or (B, S, 4, 4), several starts.
         weights: (B, H, W) factors on the information of each pixel; None: all alike.
-        lead: (B,) log odds that the motion is the camera's, by the network that it and the weights
-            come from: evidence for the probability of the answer; None: not known.
+        evidence: (B, 4) what speaks for the motion, a
+            :class:`~hybridvo.hypotheses.select.ChoiceEvidence` each, NaN where nothing speaks for
+            or against it; None: not known.
         covariance: (B, 6, 6) of the left perturbation of the motion; m^2, m rad, rad^2: how far
             from it the motion is sought; None: not stated.
 
     Example:
         >>> import torch
         >>> import hybridvo as hvo
-        >>> seed = hvo.PoseSeed(torch.eye(4).expand(3, 4, 4), lead=torch.zeros(3))
+        >>> seed = hvo.PoseSeed(torch.eye(4).expand(3, 4, 4), weights=torch.ones(3, 6, 8))
         >>> seed.part(slice(1, None)).T_curr_prev.shape
         torch.Size([2, 4, 4])
     """
 
     T_curr_prev: torch.Tensor
     weights: torch.Tensor | None = None
-    lead: torch.Tensor | None = None
+    evidence: torch.Tensor | None = None
     covariance: torch.Tensor | None = None
 
     def part(self, samples: slice | torch.Tensor) -> PoseSeed:
@@ -53,7 +54,7 @@ class PoseSeed(NamedTuple):
         return PoseSeed(
             self.T_curr_prev[samples],
             None if self.weights is None else self.weights[samples],
-            None if self.lead is None else self.lead[samples],
+            None if self.evidence is None else self.evidence[samples],
             None if self.covariance is None else self.covariance[samples],
         )
 
