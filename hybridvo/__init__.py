@@ -40,12 +40,12 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.io.example import example_frames as example_frames
     from hybridvo.network.pwvo import PWVO as PWVO
     from hybridvo.network.selection import select as select
+    from hybridvo.odometry import Odometry as Odometry
     from hybridvo.solver.torch.batched_pose import BatchedPose as BatchedPose
     from hybridvo.solver.torch.tools import PoseSeed as PoseSeed
     from hybridvo.tracking.chains import chain_covariance as chain_covariance
     from hybridvo.tracking.chains import to_g2o_information as to_g2o_information
     from hybridvo.tracking.inertial import gyro_prior as gyro_prior
-    from hybridvo.tracking.odometry import Odometry as Odometry
     from hybridvo.tracking.passes import track_in_passes as track_in_passes
 
 __version__ = "0.2.0"
@@ -66,7 +66,7 @@ _HOME = {
         "solver.torch.tools": "PoseSeed",
         "network.pwvo": "PWVO",
         "network.selection": "select",
-        "tracking.odometry": "Odometry",
+        "odometry": "Odometry",
         "core.trajectory": "Trajectory",
         "api": "estimate refine",
         "io.data.open": "open_sequence iter_pairs",

@@ -41,6 +41,7 @@ DOWN = 2.0 / 3.0
 ROOMS = (
     *("hybridvo.core", "hybridvo.flow", "hybridvo.solver", "hybridvo.judge"),
     *("hybridvo.hypotheses", "hybridvo.evidence", "hybridvo.tracking"),
+    "hybridvo.objects",
     *("hybridvo.io", "hybridvo.run", "hybridvo_lab", "hybridvo_lab.baselines"),
 )
 """Rooms with numbers that decide."""
@@ -512,7 +513,7 @@ def load_all() -> None:
 
     import hybridvo
     import hybridvo_lab
-    from hybridvo.tracking.odometry import warm_up
+    from hybridvo.tracking.tracker import warm_up
 
     # what finds motions, and what the cases of doctor and evaluation measure
     wanted = ("pipeline", "network", "solver", "hypotheses", "judge", "flow", "run")

@@ -36,8 +36,8 @@ from hybridvo.io.data.resize import resize_frame
 from hybridvo.io.live_rate import MIN_POSES_HZ, AutoRate, RateKeeper
 from hybridvo.io.viewer.scene import Seen
 from hybridvo.io.viewer.viewer import Viewer
+from hybridvo.odometry import Odometry
 from hybridvo.tracking.keyframes import has_enough_depth
-from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.tracker_state import TrackerState
 
 # s, from which a frame is dropped: sensors hand one out after 0.02 to 0.1 s, above
@@ -627,11 +627,12 @@ class LiveStream:
     def _start_at(self, state: TrackerState) -> None:
         """Begin at the last pose of a tracker, with what it knows of the IMU."""
         self._odometry.set_pose(state.T_world_last)
-        self._odometry.state = replace(
-            self._odometry.state,
-            gyroscope=state.gyroscope,
-            accelerometer=state.accelerometer,
+        known = replace(
+            self._odometry.state.sensors,
+            gyroscope=state.sensors.gyroscope,
+            accelerometer=state.sensors.accelerometer,
         )
+        self._odometry.state = replace(self._odometry.state, sensors=known)
 
 
 class _Placed(NamedTuple):

@@ -22,8 +22,8 @@ from hybridvo.io.calibration import (
 )
 from hybridvo.io.cameras.settings import LIVE_RATE_HZ
 from hybridvo.io.data.resize import resize_frame
+from hybridvo.odometry import Odometry
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.tracking.odometry import Odometry
 
 # poses a second that are kept where the camera's rate cannot be: a hand moves by a
 # few centimetres meanwhile, which the search still finds

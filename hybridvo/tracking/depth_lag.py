@@ -26,8 +26,8 @@ from hybridvo.solver.depth_alone import motion_by_depth
 from hybridvo.solver.newton import positive_inverse
 from hybridvo.tracking.calibration import MIN_TURN_GROWTH
 from hybridvo.tracking.camera_drift import MAX_EVEN_MS, Bend, robust_mean
-from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.repeated import repeat_of
+from hybridvo.tracking.tracker import Tracker
 
 # Pairs before which nothing is stated of the lag.
 MIN_LAG_PAIRS = 20
@@ -58,7 +58,7 @@ def find_lag(frames: Iterable[Frame]) -> Lag | None:
     Returns:
         The lag; None where too few of them show it.
     """
-    tracker = Odometry()
+    tracker = Tracker()
     turns: list[_Turn | None] = []
     before = None
     for each in frames:

@@ -37,13 +37,17 @@ WEIGHT_STRIDE = 4
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A frame with a known pose, from which a later motion can be estimated."""
+    """A frame with a known pose, from which a later motion can be estimated.
+
+    The reference, the frame before, is one as well; it is no keyframe where it is not sure.
+    """
 
     frame: Frame
     T_world_cam: np.ndarray  # (4, 4)
     count: int  # number of the frame since the tracker began
     origin: int  # the same of the frame that its own motion was estimated from
     covariance: np.ndarray  # (6, 6) of that motion; zero of the first frame
+    is_sure: bool = True  # whether that motion was ok
 
     def moved(self, T_new_old: np.ndarray) -> Keyframe:
         """Return the keyframe in another world frame, for instance after a loop closure."""

@@ -41,7 +41,6 @@ from hybridvo.tracking.calibration import (
     OTHER_STD_OF_GRADIENT,
     SEEN_THROUGH_LOG_ODDS,
 )
-from hybridvo.tracking.estimates import Estimate
 from hybridvo.tracking.keyframes import Keyframe
 
 # Side of the square, in points of the grid, over which what each shows is averaged: its
@@ -107,17 +106,17 @@ def faded(memory: Memory) -> Memory:
     return replace(memory, belief=Belief(log_odds, BELIEF_DECAY * belief.certainty))
 
 
-def memory_after(memory: Memory | None, frame: Frame, estimate: Estimate) -> Memory:
-    """Return what is remembered after a motion, on the oldest keyframe in use.
+def memory_after(
+    memory: Memory | None, home: Keyframe, frame: Frame, motion: RelativePose
+) -> Memory:
+    """Return what is remembered after a motion, on a keyframe.
 
     Args:
         memory: before.
+        home: the keyframe.
         frame: the current one.
-        estimate: the motion to it.
+        motion: from the keyframe to the frame.
     """
-    home = estimate.home
-    T_curr_home = invert(estimate.T_world_cam) @ home.T_world_cam
-    motion = estimate.motion.replace(T_curr_prev=T_curr_home)
     return after_step(carried_to(memory, home), frame, motion)
 
 

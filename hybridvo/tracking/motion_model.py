@@ -25,6 +25,7 @@ class MotionModel:
     # decaying sum of squares
     spread: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     changes: int = 0  # so far
+    failed: int = 0  # motions that failed since the last one that was found
 
     def observed(
         self, T_curr_prev: np.ndarray, neighbours: bool = True
@@ -33,7 +34,7 @@ class MotionModel:
         # copied, for the user gets the same array in a step and may change it
         T_curr_prev = np.array(T_curr_prev)
         if self.T_last is None or not neighbours:
-            return replace(self, T_last=T_curr_prev)
+            return replace(self, T_last=T_curr_prev, failed=0)
         change = se3_log(T_curr_prev @ invert(self.T_last))
         spread = CHANGE_DECAY * self.spread + np.outer(change, change)
         return MotionModel(T_curr_prev, spread, self.changes + 1)

@@ -33,8 +33,8 @@ from hybridvo.tracking.camera_drift import (
     bends_of,
     robust_mean,
 )
-from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.repeated import repeat_of
+from hybridvo.tracking.tracker import Tracker
 
 # frames whose poses give the velocities of the two in the middle
 NEIGHBOURS = 4
@@ -96,7 +96,7 @@ class Tracked(NamedTuple):
 def track_in_passes(
     frames: Sequence[Frame],
     passes: int = 3,
-    make_tracker: Callable[[], Odometry] = Odometry,
+    make_tracker: Callable[[], Tracker] = Tracker,
 ) -> Tracked:
     """Track a recording several times, each time with what the pass before has shown.
 
@@ -136,7 +136,7 @@ def track_in_passes(
 def find_times(
     frames: Sequence[Frame],
     passes: int = 2,
-    make_tracker: Callable[[], Odometry] = Odometry,
+    make_tracker: Callable[[], Tracker] = Tracker,
 ) -> PixelTimes:
     """Return when the pixels of a recording were measured, by tracking it some times.
 
@@ -200,7 +200,7 @@ def _check_can_be_read_again(frames: object) -> None:
         )
 
 
-def _new_tracker(make_tracker: Callable[[], Odometry]) -> Odometry:
+def _new_tracker(make_tracker: Callable[[], Tracker]) -> Tracker:
     """A tracker for a pass; an InputError unless it is one that has tracked nothing."""
     where = "track_in_passes.make_tracker"
     if not callable(make_tracker):
@@ -209,7 +209,7 @@ def _new_tracker(make_tracker: Callable[[], Odometry]) -> Odometry:
             f"{where}: expected a function that returns a new tracker, got {got}."
         )
     tracker = make_tracker()
-    check_kind(f"{where}()", tracker, Odometry)
+    check_kind(f"{where}()", tracker, Tracker)
     if tracker.state.count:
         raise InputError(
             f"{where}(): expected a new tracker, got one that has tracked "

@@ -131,13 +131,11 @@ def motion_without_image(
     Returns:
         The motion; None where the camera may as well have stood still.
     """
-    assert state.frame is not None
+    reference = state.known_reference.frame
     held = state.T_last_reference
     expected = given or state.expected()
-    pair = FramePair(state.frame, frame, None)
-    if expected is None or _stands(
-        state.frame, expected.T_curr_prev @ invert(held)
-    ):
+    pair = FramePair(reference, frame, None)
+    if expected is None or _stands(reference, expected.T_curr_prev @ invert(held)):
         if not depth_is_fresh or _agrees_with_standing(pair, held):
             return None
     went_on = None

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from hybridvo.core.geometry import invert
 from hybridvo.core.gravity import Gravity
-from hybridvo.core.results import MotionPrior, RelativePose, Step
+from hybridvo.core.results import MotionPrior, Term
 from hybridvo.core.types import Frame
 from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.depth_scale import (
@@ -24,46 +23,85 @@ from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.stamps import Clock
 
-if TYPE_CHECKING:
-    from hybridvo.tracking.objects import Objects, Things
+
+@dataclass(frozen=True, eq=False)
+class Sensors:
+    """What is known of a camera and its sensors, beside where it is.
+
+    Attributes:
+        last: the last frame, as it came.
+        clock: whether the stamps of the frames rise.
+        scale: how well the scale of all depths is known, where each frame has its own.
+        gyroscope: where samples were handed in.
+        accelerometer: where they had accelerations.
+    """
+
+    last: Frame | None = None
+    clock: Clock = field(default_factory=Clock)
+    scale: ScaleFilter = field(default_factory=ScaleFilter)
+    gyroscope: Gyroscope | None = None
+    accelerometer: Accelerometer | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class TrackerState:
-    """The state of a tracker after a frame, with which another tracker can go on."""
+    """The state of a tracker after a frame, with which another tracker can go on.
 
-    frame: Frame | None = None  # the reference, from which the next motion starts
-    # pose of the reference
-    T_world_cam: np.ndarray = field(default_factory=lambda: np.eye(4))
-    # pose of the last step
-    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
-    motion_model: MotionModel = field(default_factory=MotionModel)
-    gap: int = 0  # frames passed over since the reference
-    failed: int = 0  # motions that failed since the last one that was found
-    count: int = 0  # frames so far
-    is_sure: bool = True  # whether the motion of the reference was ok
-    by_depth: bool = False  # whether the last step was by depth alone
-    used_flow: bool = False  # whether the last motion needed flow
-    # number of the first frame that leads here: no motion is known from earlier ones
+    Attributes:
+        reference: from which the next motion starts; None before the first frame.
+        keyframes: oldest first.
+        places: from which a lost path is found again.
+        part: number of the first frame that leads here: no motion is known from earlier ones.
+        memory: which parts of the view are static.
+        motion_model: what is expected of the next motion.
+        T_world_last: (4, 4) pose of the last step.
+        count: frames so far.
+        found_by: what the last motion is based on; nothing where it failed.
+        sensors: what is known of the camera beside that.
+    """
+
+    reference: Keyframe | None = None
+    keyframes: tuple[Keyframe, ...] = ()
+    places: tuple[Keyframe, ...] = ()
     part: int = 0
-    keyframes: tuple[Keyframe, ...] = ()  # oldest first
-    places: tuple[Keyframe, ...] = ()  # from which a lost path is found again
-    memory: Memory | None = None  # which parts of the view are static
-    things: Things | None = None  # what else moves, where that is sought
-    # how well the scale of all depths is known, where each frame has its own
-    scale: ScaleFilter = field(default_factory=ScaleFilter)
-    gyroscope: Gyroscope | None = None  # where samples were handed in
-    accelerometer: Accelerometer | None = None  # where they had accelerations
-    last: Frame | None = None  # the last frame, as it came
-    clock: Clock = field(default_factory=Clock)
+    memory: Memory | None = None
+    motion_model: MotionModel = field(default_factory=MotionModel)
+    T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
+    count: int = 0
+    found_by: tuple[Term, ...] = ()
+    sensors: Sensors = field(default_factory=Sensors)
+
+    @property
+    def known_reference(self) -> Keyframe:
+        """The reference, of a tracker that has seen a frame."""
+        assert self.reference is not None
+        return self.reference
+
+    @property
+    def frame(self) -> Frame | None:
+        """The frame from which the next motion starts."""
+        return None if self.reference is None else self.reference.frame
+
+    @property
+    def gap(self) -> int:
+        """How many frames were passed over since the reference."""
+        return (
+            0 if self.reference is None else self.count - self.reference.count - 1
+        )
+
+    @property
+    def is_by_depth(self) -> bool:
+        """Whether the last step was by depth alone."""
+        found_by = {Term.IMAGES, Term.FLOW} & set(self.found_by)
+        return Term.DEPTH in self.found_by and not found_by
 
     @property
     def starts(self) -> dict[int, Frame]:
         """The frames from which the next motion may start, by their index."""
-        held = [each.frame for each in (*self.places, *self.keyframes)]
-        if self.frame is not None:
-            held.append(self.frame)
-        return {frame.index: frame for frame in held}
+        held = [*self.places, *self.keyframes]
+        if self.reference is not None:
+            held.append(self.reference)
+        return {each.frame.index: each.frame for each in held}
 
     @property
     def nearest_starts(self) -> list[Frame]:
@@ -74,12 +112,8 @@ class TrackerState:
     @property
     def gravity(self) -> Gravity | None:
         """Which way is down; None where no accelerometer has shown it."""
-        return None if self.accelerometer is None else self.accelerometer.gravity()
-
-    @property
-    def T_last_reference(self) -> np.ndarray:
-        """(4, 4) motion from the reference to the last frame."""
-        return invert(self.T_world_last) @ self.T_world_cam
+        accelerometer = self.sensors.accelerometer
+        return None if accelerometer is None else accelerometer.gravity()
 
     def expected(self) -> MotionPrior | None:
         """What is expected of the motion from the reference to the next frame.
@@ -93,32 +127,89 @@ class TrackerState:
         T = one.T_curr_prev @ self.T_last_reference
         return MotionPrior(T, all_since.covariance)
 
+    @property
+    def T_last_reference(self) -> np.ndarray:
+        """(4, 4) motion from the reference to the last frame."""
+        return invert(self.T_world_last) @ self.known_reference.T_world_cam
+
+    def unsure(self, frame: Frame, T_world_cam: np.ndarray) -> Keyframe:
+        """The next frame as a reference whose motion is not sure."""
+        count = self.count
+        unknown = unknown_covariance()
+        return Keyframe(frame, T_world_cam, count, count, unknown, is_sure=False)
+
+    def advanced(
+        self,
+        T_world_cam: np.ndarray,
+        reference: Keyframe | None = None,
+        found_by: tuple[Term, ...] = (),
+    ) -> TrackerState:
+        """Return the state after a frame.
+
+        Args:
+            T_world_cam: (4, 4) its pose.
+            reference: the frame, where the next motion starts from it.
+            found_by: what its motion is based on.
+        """
+        return replace(
+            self,
+            T_world_last=T_world_cam,
+            count=self.count + 1,
+            reference=reference or self.reference,
+            found_by=found_by,
+        )
+
     def without_velocity(self) -> TrackerState:
         """Return the state that expects nothing of the next motion."""
         model = replace(self.motion_model, T_last=None)
         return replace(self, motion_model=model)
+
+    def with_scale(self, scale: ScaleFilter) -> TrackerState:
+        """Return the state with what is known of the scale of all depths."""
+        return replace(self, sensors=replace(self.sensors, scale=scale))
 
     def starting_with(self, frame: Frame) -> TrackerState:
         """Return the state with another frame in the place of the reference."""
         was = self.frame
 
         def changed(keyframe: Keyframe) -> Keyframe:
-            return (
-                replace(keyframe, frame=frame)
-                if keyframe.frame is was
-                else keyframe
-            )
+            is_it = keyframe.frame is was
+            return replace(keyframe, frame=frame) if is_it else keyframe
 
         return replace(
             self,
-            frame=frame,
+            reference=changed(self.known_reference),
             keyframes=tuple(map(changed, self.keyframes)),
             places=tuple(map(changed, self.places)),
         )
 
+    def moved(self, T_world_cam: np.ndarray) -> TrackerState:
+        """Return the state in a world in which the camera is elsewhere, (4, 4).
+
+        Reference and keyframes keep their places relative to the last pose.
+        """
+        T_new_old = T_world_cam @ invert(self.T_world_last)
+        reference = self.reference
+        if reference is not None:
+            reference = reference.moved(T_new_old)
+            if not self.gap:
+                reference = replace(reference, T_world_cam=T_world_cam)
+        sensors = self.sensors
+        if sensors.accelerometer is not None:
+            turned = sensors.accelerometer.moved(T_new_old)
+            sensors = replace(sensors, accelerometer=turned)
+        return replace(
+            self,
+            T_world_last=T_world_cam,
+            reference=reference,
+            keyframes=tuple(each.moved(T_new_old) for each in self.keyframes),
+            places=tuple(each.moved(T_new_old) for each in self.places),
+            memory=None if self.memory is None else self.memory.moved(T_new_old),
+            sensors=sensors,
+        )
+
     def rescaled(self, factor: float) -> TrackerState:
         """Return the state after all lengths grew by a factor; the last pose stays."""
-        frame = None if self.frame is None else divided(self.frame, 1 / factor)
         model = self.motion_model
         if model.T_last is not None:
             T_last = lengthened(model.T_last, factor)
@@ -138,55 +229,14 @@ class TrackerState:
             memory = replace(memory, keyframe=rescaled(memory.keyframe))
         return replace(
             self,
-            frame=frame,
-            T_world_cam=rescaled_about(self.T_world_cam, here, factor),
+            reference=rescaled(self.known_reference),
             motion_model=model,
             keyframes=tuple(map(rescaled, self.keyframes)),
             places=tuple(map(rescaled, self.places)),
             memory=memory,
-            things=None if self.things is None else self.things.rescaled(factor),
         )
 
 
-class Outcome(NamedTuple):
-    """What follows from a frame."""
-
-    state: TrackerState
-    step: Step
-
-
-def advanced(
-    state: TrackerState,
-    frame: Frame,
-    T_world_cam: np.ndarray,
-    leads: bool,
-    is_sure: bool,
-) -> TrackerState:
-    """Return a state that counts a frame, and makes it the reference if it leads."""
-    state = replace(
-        state, T_world_last=T_world_cam, count=state.count + 1, by_depth=False
-    )
-    if not leads:
-        return replace(state, gap=state.gap + 1)
-    return replace(
-        state, frame=frame, T_world_cam=T_world_cam, gap=0, is_sure=is_sure
-    )
-
-
-def step_of(
-    frame: Frame,
-    T_world_cam: np.ndarray,
-    motion: RelativePose,
-    prev_index: int | None,
-    objects: Objects | None = None,
-) -> Step:
-    """The step of a frame, with a copy of its pose (4, 4)."""
-    seen = () if objects is None else objects.seen
-    return Step(
-        frame.index,
-        frame.timestamp,
-        T_world_cam.copy(),
-        motion,
-        prev_index,
-        objects=seen,
-    )
+def unknown_covariance() -> np.ndarray:
+    """(6, 6) zeros: of the motion of a frame that is no keyframe none is kept."""
+    return np.zeros((6, 6))

@@ -35,11 +35,11 @@ from hybridvo.io.data.open import open_sequence
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.data.truth import true_trajectory
 from hybridvo.network.models import Models
+from hybridvo.odometry import Odometry
 from hybridvo.run.commands.ready_methods import methods_to_run
 from hybridvo.run.commands.run import flow_provider, frames_of, run
 from hybridvo.run.commands.run_folder import weights_hash
 from hybridvo.run.commands.text import reasons_of
-from hybridvo.tracking.odometry import Odometry
 from hybridvo_lab import baselines
 from hybridvo_lab.cluster import Workers
 from hybridvo_lab.evaluation import protocols, scores

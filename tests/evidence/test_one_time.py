@@ -95,8 +95,8 @@ def test_a_tracker_keeps_depth_of_the_time_of_the_image() -> None:
     tracker = hvo.Odometry()
     for frame in frames:
         tracker.track(frame)
-    assert tracker.state.last is not None
-    assert np.array_equal(tracker.state.last.depth, frames[-1].depth)
+    assert tracker.state.sensors.last is not None
+    assert np.array_equal(tracker.state.sensors.last.depth, frames[-1].depth)
     assert tracker.state.frame is not None
     kept = tracker.state.frame.depth
     assert wrong(kept, true) < 0.5 * wrong(frames[-1].depth, true)

@@ -12,8 +12,8 @@ from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import Reason, RelativePose, StageFailed, Status
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
+from hybridvo.odometry import Odometry
 from hybridvo.pipeline import Context, by_first_source, first_sure
-from hybridvo.tracking.odometry import Odometry
 from hybridvo_lab.synthetic.scenes import make_scene
 
 STEP = se3_exp(np.array([0.005, 0, 0, 0, 0, 0]))

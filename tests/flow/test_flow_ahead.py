@@ -7,11 +7,12 @@ import threading
 import numpy as np
 import pytest
 
+from hybridvo.core.results import Term
 from hybridvo.core.types import Frame
 from hybridvo.flow.providers import FlowAhead, FlowField
 from hybridvo.pipeline import Context
-from hybridvo.tracking.setup import Setup
-from hybridvo.tracking.tracker import Pairs, Query
+from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.search import Arrival, Pairs, Setup
 from hybridvo.tracking.tracker_state import TrackerState
 from tests import worlds
 
@@ -68,8 +69,9 @@ def test_only_our_flow_is_computed_ahead_and_only_where_it_is_expected(
 ):
     provider = Provider(source)
     setup = Setup("hybrid", Context(flow=provider))
-    state = TrackerState(frame(), used_flow=expects_flow)
-    query = Query(frame(), flow=None, given=None, deadline=None)
-    with Pairs(setup, state, query).flow_ahead():
+    before = Keyframe(frame(), np.eye(4), 0, 0, np.zeros((6, 6)))
+    found_by = (Term.FLOW,) if expects_flow else ()
+    state = TrackerState(before, count=1, found_by=found_by)
+    with Pairs(setup, state, Arrival(frame())).flow_ahead():
         pass
     assert len(provider.threads) == calls

@@ -18,11 +18,11 @@ from hybridvo.core.results import RelativePose
 from hybridvo.core.trajectory import read_trajectory
 from hybridvo.io.data.open import open_sequence
 from hybridvo.network.models import Models
+from hybridvo.odometry import Odometry
 from hybridvo.pipeline import METHODS, Method, method_names
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run_folder import weights_hash
 from hybridvo.run.commands.text import text_of
-from hybridvo.tracking.odometry import Odometry
 from hybridvo_lab.commands.compare import WRITTEN, compare, methods_to_run, open_all
 from hybridvo_lab.evaluation.scores import PAIR_COLUMNS
 from hybridvo_lab.synthetic.render import write_sintel

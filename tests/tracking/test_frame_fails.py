@@ -6,7 +6,7 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.evidence import one_time
-from hybridvo.tracking import following
+from hybridvo.tracking import step
 from tests.late_depth import rolling_frames
 
 
@@ -14,9 +14,9 @@ from tests.late_depth import rolling_frames
     ("room", "broken", "number"),
     [
         (one_time, "follow_roughly", 2),
-        (following, "keep", 2),
+        (step, "keep", 2),
         # its stamp jumps back, so that no velocity is known
-        (following, "keep", 0),
+        (step, "keep", 0),
     ],
 )
 def test_a_tracker_is_as_it_was(

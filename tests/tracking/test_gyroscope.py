@@ -15,7 +15,7 @@ from hybridvo.core.geometry import invert, make_transform
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.io.data.open import open_sequence
 from hybridvo.solver.rotation_factor import with_rotation
-from hybridvo.tracking import odometry
+from hybridvo.tracking import tracker as tracking
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo_lab.synthetic.render import SyntheticSequence
 from hybridvo_lab.synthetic.scenes import make_scene
@@ -141,13 +141,13 @@ def test_a_tracker_learns_the_bias_and_expects_the_turn(
     frames = [SyntheticSequence(scene)[i] for i in range(6)]
     tracker = hvo.Odometry()
     priors = []
-    outcome_of = odometry.outcome_of
+    follow = tracking.follow
 
-    def spied(setup, state, query, repeat):
-        priors.append(query.given)
-        return outcome_of(setup, state, query, repeat)
+    def spied(setup, state, arrival):
+        priors.append(arrival.given)
+        return follow(setup, state, arrival)
 
-    monkeypatch.setattr(odometry, "outcome_of", spied)
+    monkeypatch.setattr(tracking, "follow", spied)
     truth = [invert(T) @ scene.T_world_cam[0] for T in scene.T_world_cam]
     for k, frame in enumerate(frames):
         imu = None
@@ -159,7 +159,7 @@ def test_a_tracker_learns_the_bias_and_expects_the_turn(
         stamped = hvo.Frame(frame.rgb, frame.depth, frame.camera, k * FRAME_S, k)
         step = tracker.track(stamped, imu=imu)
         assert step.usable
-    gyroscope = tracker.state.gyroscope
+    gyroscope = tracker.state.sensors.gyroscope
     assert gyroscope is not None
     np.testing.assert_allclose(gyroscope.bias, BIAS, atol=0.02)
     # the last turn was expected before the images were looked at

@@ -13,12 +13,12 @@ import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import Step
-from hybridvo.run.commands.run import restored, saved
-from hybridvo.tracking.object_motions import (
+from hybridvo.objects.followed import MAX_OBJECTS, Things, after_step
+from hybridvo.objects.motions import (
     Earlier,
     GridView,
 )
-from hybridvo.tracking.objects import MAX_OBJECTS, Things, after_step
+from hybridvo.run.commands.run import restored, saved
 from hybridvo_lab.synthetic.scenes import make_scene
 from tests.worlds import CHI2_3SIGMA
 
@@ -74,9 +74,9 @@ def follow(frames: list[hvo.Frame]) -> list[tuple[hvo.MovingObject, ...]]:
     for k in range(1, len(frames)):
         before = Earlier(frames[k - 1], np.eye(4))
         far = Earlier(frames[0], np.eye(4)) if k > 1 else None
-        found = after_step(things, GridView(frames[k], before, far), 1, Options())
-        things = found.things
-        seen.append(found.seen)
+        views = GridView(frames[k], before, far)
+        things, shown = after_step(things, views, 1, Options())
+        seen.append(shown)
     return seen
 
 
@@ -161,7 +161,7 @@ def test_a_camera_that_moves_past_a_standing_scene_sees_none() -> None:
     scene = make_scene("static", 0, height=120, width=160, frames=5)
     vo = hvo.Odometry(network=None, options=ON)
     assert all(not vo.track(scene.render(k)).objects for k in range(5))
-    assert vo.state.things.known == ()
+    assert vo.things.known == ()
 
 
 def steps_of(frames: list[hvo.Frame], options: Options) -> list[Step]:
@@ -198,10 +198,11 @@ def test_a_resumed_tracker_goes_on_with_the_same_objects() -> None:
     vo = hvo.Odometry(network=None, options=ON)
     for frame in frames[:4]:
         vo.track(frame)
-    text = json.dumps(saved(vo.state))
+    text = json.dumps(saved((vo.state, vo.things)))
     other = hvo.Odometry(network=None, options=ON)
-    other.resume(restored(json.loads(text), OfFrames(frames)))  # type: ignore[arg-type]
-    assert vo.state.things.known
+    state, things = restored(json.loads(text), OfFrames(frames))  # type: ignore[arg-type]
+    other.resume(state, things)
+    assert vo.things.known
     for frame in frames[4:]:
         one = vo.track(frame).objects
         two = other.track(frame).objects
@@ -213,9 +214,8 @@ def test_a_resumed_tracker_goes_on_with_the_same_objects() -> None:
 
 def test_all_lengths_of_objects_grow_with_the_scale() -> None:
     frames = [view(Box(30 + 3 * k), index=k) for k in range(3)]
-    things = after_step(
-        Things(), GridView(frames[1], Earlier(frames[0], np.eye(4))), 1, Options()
-    ).things
+    pair = GridView(frames[1], Earlier(frames[0], np.eye(4)))
+    things, _ = after_step(Things(), pair, 1, Options())
     larger = things.rescaled(2.0)
     (one,), (two,) = things.known, larger.known
     np.testing.assert_allclose(two.points, 2 * one.points)

@@ -14,8 +14,8 @@ from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import Reason, State
 from hybridvo.core.types import Camera, Frame
 from hybridvo.flow.providers import FlowField, dis_flow
+from hybridvo.odometry import Odometry
 from hybridvo.pipeline import DEFAULT_METHOD
-from hybridvo.tracking.odometry import Odometry
 from hybridvo_lab.synthetic.scenes import make_scene
 
 HEIGHT, WIDTH = 48, 64

@@ -12,7 +12,7 @@ from hybridvo import pipeline
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import dis_flow
-from hybridvo.tracking import tracker
+from hybridvo.tracking import search
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.relocalization import PLACES, similar_places, with_place
 from hybridvo_lab.synthetic.slow_scenes import slow_scene
@@ -178,7 +178,7 @@ def test_an_answer_that_is_late_is_not_improved(frames):
 
 def test_no_place_is_tried_after_the_time_is_over(frames, monkeypatch):
     sought = []
-    monkeypatch.setattr(tracker, "from_place", lambda *_: sought.append("place"))
+    monkeypatch.setattr(search, "from_place", lambda *_: sought.append("place"))
     noise = np.random.default_rng(0).integers(0, 255, frames[0].rgb.shape)
     no_depth = np.zeros_like(frames[1].depth)
     lost = replace(frames[1], rgb=noise.astype(np.uint8), depth=no_depth)

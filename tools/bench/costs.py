@@ -44,7 +44,7 @@ REPEATS = 5
 FRESH_PROCESS = """
 import json, time
 begin = time.perf_counter()
-from hybridvo.tracking.odometry import warm_up
+from hybridvo.tracking.tracker import warm_up
 imported = time.perf_counter()
 warm_up("hybrid")
 print(json.dumps({"import_s": imported - begin, "warm_up_s": time.perf_counter() - imported}))

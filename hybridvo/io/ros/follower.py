@@ -25,10 +25,10 @@ from hybridvo.io.ros.frames import FrameReader, stamp_ns
 from hybridvo.io.ros.inbox import Arrived
 from hybridvo.io.ros.parameters import NodeOptions
 from hybridvo.network.models import Models
+from hybridvo.odometry import Odometry
 from hybridvo.pipeline import check_method
 from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.keyframes import has_enough_depth
-from hybridvo.tracking.odometry import Odometry
 
 
 class Moving(NamedTuple):

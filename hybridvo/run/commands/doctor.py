@@ -29,6 +29,7 @@ from hybridvo.io.data.sequence import Sequence
 from hybridvo.io.data.truth import true_motion
 from hybridvo.io.example import example_frames
 from hybridvo.io.resolution import resolution_question
+from hybridvo.odometry import Odometry
 from hybridvo.run.calibration import (
     EMPTY_DEPTH,
     MAX_SCALE_ERROR,
@@ -59,7 +60,7 @@ from hybridvo.solver.covariance import direction_is_known
 from hybridvo.solver.depths import compare_depths
 from hybridvo.tracking.calibration import MAX_FOCAL_ERROR
 from hybridvo.tracking.camera_drift import MIN_CAMERA_STEPS, FocalDrift, bends_of
-from hybridvo.tracking.odometry import Odometry, warm_up
+from hybridvo.tracking.tracker import warm_up
 
 # pairs with a true motion from which the scale of depth is judged
 MIN_SCALE_PAIRS = 6

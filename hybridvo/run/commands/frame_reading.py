@@ -7,14 +7,14 @@ from hybridvo.core.imu import ImuSamples
 from hybridvo.core.results import Step
 from hybridvo.core.types import Frame
 from hybridvo.io.data.sequence import Sequence
-from hybridvo.tracking.odometry import Odometry
+from hybridvo.odometry import Odometry
 
 
 def samples_before(
     sequence: Sequence, frame: Frame, tracker: Odometry
 ) -> ImuSamples | None:
     """Return what an IMU of the recording measured since the frame that the tracker saw last."""
-    last = tracker.state.last
+    last = tracker.state.sensors.last
     if last is None:
         return None
     return sequence.imu(last.timestamp, frame.timestamp)

@@ -41,6 +41,7 @@ from hybridvo.io.viewer.recording import RecordingWriter, check_recording
 from hybridvo.io.viewer.scene import Sink
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
+from hybridvo.odometry import Odometry
 from hybridvo.pipeline import check_method
 from hybridvo.run.commands.advice import advice_on
 from hybridvo.run.commands.run_folder import (
@@ -51,7 +52,6 @@ from hybridvo.run.commands.run_folder import (
 )
 from hybridvo.run.commands.stopping import StopRequest, stop_requested
 from hybridvo.run.commands.terminal import STYLES
-from hybridvo.tracking.odometry import Odometry
 
 # s over which the images of a Rerun recording are spread where a run has no end:
 # ten minutes, with an image every second

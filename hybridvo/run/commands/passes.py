@@ -13,9 +13,9 @@ from hybridvo.core.errors import InputError, printable
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.selected import WholeSequence
 from hybridvo.io.data.sequence import Sequence
+from hybridvo.odometry import Odometry
 from hybridvo.run.commands.frame_reading import samples_before, skipped
 from hybridvo.run.commands.stopping import stop_requested
-from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.passes import PixelTimes, TimesFinder, finders
 
 

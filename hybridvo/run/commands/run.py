@@ -48,6 +48,8 @@ from hybridvo.io.viewer.recording import RecordingWriter, check_recording
 from hybridvo.io.viewer.scene import Seen, Sink, position_covariance
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
+from hybridvo.objects.followed import Thing, Things
+from hybridvo.odometry import Odometry
 from hybridvo.pipeline import check_method
 from hybridvo.run.commands.advice import advice_on, likely_causes
 from hybridvo.run.commands.diagnosis.causes import depth_delay, likely_cause
@@ -87,11 +89,9 @@ from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.motion_model import MotionModel
-from hybridvo.tracking.objects import Thing, Things
-from hybridvo.tracking.odometry import Odometry
 from hybridvo.tracking.passes import PixelTimes, TimesFinder
 from hybridvo.tracking.stamps import Clock
-from hybridvo.tracking.tracker_state import TrackerState
+from hybridvo.tracking.tracker_state import Sensors, TrackerState
 
 ARRAYS = (
     "index",
@@ -109,6 +109,7 @@ STATE_CLASSES = {
     kind.__name__: kind
     for kind in (
         TrackerState,
+        Sensors,
         MotionModel,
         Keyframe,
         ScaleFilter,
@@ -428,14 +429,16 @@ class _Run:
                 say(f"warning: {warning}")
             self.warnings_shown = len(self.sequence.warnings)
             if self.folder.tracker is not None:
-                self.tracker.resume(restored(self.folder.tracker, self.sequence))
+                state, things = restored(self.folder.tracker, self.sequence)
+                self.tracker.resume(state, things)
                 say(f"resumed after {len(rows)} of {total} frames")
             doubts = _Doubts()
             for index in self.frames[len(rows) :]:
                 with stage_times() as times:
                     row = self._track(index)
                 row["stages"] = times.rounded()
-                self.folder.add(row, saved(self.tracker.state))
+                known = (self.tracker.state, self.tracker.things)
+                self.folder.add(row, saved(known))
                 if text := doubts.line(row):
                     say(text, STYLES[row["status"]])
                 failed += row["status"] == "failed"

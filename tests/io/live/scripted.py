@@ -11,7 +11,8 @@ import numpy as np
 import hybridvo as hvo
 from hybridvo.io.cameras.base import EndOfFrames, Reading
 from hybridvo.io.live import LiveStream, Patience
-from hybridvo.tracking.odometry import TrackerState
+from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.tracker_state import TrackerState
 
 CAMERA = hvo.Camera(fx=50, fy=50, cx=7.5, cy=5.5, height=12, width=16)
 LONG_S = 60.0
@@ -113,7 +114,11 @@ class Tracker:
         self.on_track(count)
         T = np.eye(4)
         T[0, 3] = count
-        self.state = TrackerState(frame, T, T, count=count)
+        self.state = TrackerState(
+            Keyframe(frame, T, count - 1, count - 1, np.eye(6)),
+            T_world_last=T,
+            count=count,
+        )
         status = hvo.Status()
         if frame.depth is None:
             status = hvo.Status.failed(hvo.Reason.NO_VALID_DEPTH, "no depth")

@@ -195,5 +195,5 @@ def test_a_lost_frame_keeps_its_own_scale(walk: list) -> None:
     assert not lost.usable
     assert (lost.depth_scale, lost.scale_change) == (1.0, 1.0)
     # as at the beginning: the next frame tells as much of the common scale as this one
-    assert vo.state.scale.gain == 0.5
+    assert vo.state.sensors.scale.gain == 0.5
     assert vo.track(*walk[2]).usable

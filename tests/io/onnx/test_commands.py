@@ -14,7 +14,8 @@ from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.tracking.depth_scale import ScaleFilter, divided
-from hybridvo.tracking.odometry import TrackerState
+from hybridvo.tracking.keyframes import Keyframe
+from hybridvo.tracking.tracker_state import Sensors, TrackerState
 from tests.io.onnx.graphs import (
     constant_network,
     depth_network,
@@ -96,9 +97,12 @@ def test_a_resumed_run_reads_depth_in_its_scale(
     video: Path, tmp_path: Path
 ) -> None:
     sequence = open_sequence(video, depth=wall_network(tmp_path))
-    state = TrackerState(frame=divided(sequence[1], 1.25), scale=ScaleFilter(1e-4))
+    state = TrackerState(
+        Keyframe(divided(sequence[1], 1.25), np.eye(4), 1, 1, np.zeros((6, 6))),
+        sensors=Sensors(scale=ScaleFilter(1e-4)),
+    )
     again = restored(json.loads(json.dumps(saved(state))), sequence)
-    assert again.scale == state.scale
+    assert again.sensors.scale == state.sensors.scale
     assert again.frame.depth_scale == 1.25
     np.testing.assert_array_equal(again.frame.depth, state.frame.depth)
 

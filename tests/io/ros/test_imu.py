@@ -171,7 +171,7 @@ def test_samples_of_a_frame_that_cannot_be_used_go_to_the_next_one() -> None:
     assert before is first.imu and none is None
     assert between is not None
     np.testing.assert_allclose(between.stamps, np.arange(10.0, 10.195, 0.01))
-    assert tracker.state.gyroscope is not None
+    assert tracker.state.sensors.gyroscope is not None
 
 
 def test_an_accelerometer_is_not_taken_for_a_gyroscope() -> None:

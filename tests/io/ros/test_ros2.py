@@ -90,7 +90,7 @@ def tracked_by(bag: Path) -> tuple[hvo.Odometry, list[hvo.Step]]:
     sequence = open_sequence(bag)
     steps = list[hvo.Step]()
     for frame in sequence:
-        last = tracker.state.last
+        last = tracker.state.sensors.last
         imu = None
         if last is not None:
             imu = sequence.imu(last.timestamp, frame.timestamp)
@@ -167,8 +167,10 @@ def test_the_gyroscope_of_a_bag_is_used_as_a_run_uses_it(
         # turned from optical axes to body axes and back
         T = pose_in_odom(step.T_world_cam, optical_mount(""))
         np.testing.assert_allclose(scenes.pose(message), T, atol=1e-12)
-    gyroscope = node.follower._tracker.state.gyroscope
-    np.testing.assert_array_equal(gyroscope.bias, tracker.state.gyroscope.bias)
+    gyroscope = node.follower._tracker.state.sensors.gyroscope
+    np.testing.assert_array_equal(
+        gyroscope.bias, tracker.state.sensors.gyroscope.bias
+    )
     # the rotation to the camera is that of /tf_static: else it would be learned as a bias
     assert np.linalg.norm(gyroscope.bias - scenes.BIAS) < 0.5 * np.linalg.norm(
         scenes.BIAS
@@ -182,7 +184,7 @@ def test_a_gyroscope_that_is_not_fixed_to_the_camera_is_not_used(
     node = node_of(monkeypatch, topic_imu=scenes.IMU)
     play(node, turning, skip=("/tf_static",))
     assert len(node.publishers_by_topic["odom"].sent) == scenes.FRAMES
-    assert node.follower._tracker.state.gyroscope is None
+    assert node.follower._tracker.state.sensors.gyroscope is None
     assert node.said == [
         f"{scenes.IMU} is not used: no /tf_static between 'gyro' and 'color_optical'"
     ]

@@ -19,7 +19,7 @@ from hybridvo.core.stages import (
 )
 from hybridvo.core.types import Frame
 from hybridvo.io.data.sequence import Sequence
-from hybridvo.tracking.odometry import Odometry
+from hybridvo.odometry import Odometry
 
 # frames that are tracked, of the demo a third: some seconds
 SPEED_FRAMES = 60
@@ -61,7 +61,7 @@ def measure(tracker: Any, frames: Iterable[Frame]) -> dict[str, Any]:
     """Track frames, and state how long each stage took; the first frame has no motion.
 
     Args:
-        tracker: An :class:`~hybridvo.tracking.odometry.Odometry`, warmed up.
+        tracker: An :class:`~hybridvo.odometry.Odometry`, warmed up.
         frames: Two or more; taking the next one counts as reading.
     """
     rows = []

@@ -30,19 +30,20 @@ from hybridvo.core.geometry import (
     valid_depth,
 )
 from hybridvo.core.options import Options
-from hybridvo.core.results import Motion, Reason, RelativePose, StageFailed, Status
+from hybridvo.core.results import (
+    Motion,
+    Reason,
+    RelativePose,
+    StageFailed,
+    Status,
+    Step,
+)
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.frame_images import blurred
 from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo.hypotheses.refit import fit_in_mask
 from hybridvo.hypotheses.search import find_motions
-from hybridvo.solver.calibration import HIDDEN_SIGMAS
-from hybridvo.solver.pixels import PixelGrid
-from hybridvo.solver.points import Points
-from hybridvo.solver.refine_flow import Selection, refine_pair
-from hybridvo.solver.refine_images import refine_photometric
-from hybridvo.solver.visibility import visibility
-from hybridvo.tracking.calibration import (
+from hybridvo.objects.calibration import (
     BEND,
     BY_DEPTH,
     CONTACT,
@@ -69,7 +70,15 @@ from hybridvo.tracking.calibration import (
     STANDING_BONUS,
     SUSPECTED,
 )
+from hybridvo.solver.calibration import HIDDEN_SIGMAS
+from hybridvo.solver.pixels import PixelGrid
+from hybridvo.solver.points import Points
+from hybridvo.solver.refine_flow import Selection, refine_pair
+from hybridvo.solver.refine_images import refine_photometric
+from hybridvo.solver.visibility import visibility
+from hybridvo.tracking.depth_scale import divided
 from hybridvo.tracking.memory import AVERAGED_SIDE, likelihood_ratios
+from hybridvo.tracking.tracker_state import TrackerState
 
 # Fraction above which a point is as those around it, a part belongs to an object, and a pixel to
 # a mask: more than half.
@@ -118,6 +127,43 @@ class GridView:
     before: Earlier
     far: Earlier | None = None
     depth_noise: float = 0.0
+
+    @classmethod
+    def after(
+        cls, before: TrackerState, after: TrackerState, step: Step
+    ) -> GridView | None:
+        """The view of a frame that was tracked; None where it cannot show what moves.
+
+        Args:
+            before: the state of the tracker before the frame.
+            after: its state after it.
+            step: the frame's, with its motion.
+        """
+        reference = before.reference
+        leads = after.reference is not None and after.gap == 0
+        is_found = step.usable and not step.motion.is_by_depth_alone
+        if reference is None or not (leads and is_found):
+            return None
+        # as it was before all lengths grew
+        frame = divided(after.known_reference.frame, step.scale_change)
+        starts = [*before.keyframes, reference]
+        is_relocalized = step.prev_index not in [
+            each.frame.index for each in starts
+        ]
+        if is_relocalized or not (frame.is_rgbd and reference.frame.is_rgbd):
+            return None
+        T_cam_world = invert(step.T_world_cam)
+        kept = {each.count for each in after.keyframes}
+        older = [
+            each
+            for each in before.keyframes
+            if each.count in kept and each.count < reference.count
+        ]
+        far = None
+        if older and older[0].frame.depth is not None:
+            far = Earlier(older[0].frame, T_cam_world @ older[0].T_world_cam)
+        near = Earlier(reference.frame, T_cam_world @ reference.T_world_cam)
+        return cls(frame, near, far, step.motion.depth_noise)
 
     @cached_property
     def points(self) -> Points:

@@ -1,7 +1,7 @@
 """What else moves: the objects of a tracker, each under its number as long as it is followed.
 
 After a step the camera's motion is known. What does not follow it is told apart by the motions that
-it follows (:mod:`hybridvo.tracking.object_motions`), and each part is given to the object of the
+it follows (:mod:`hybridvo.objects.motions`), and each part is given to the object of the
 frame before that was expected there. An object that is hidden goes on at constant velocity for some
 frames. Nothing here changes the camera's motion.
 """
@@ -30,7 +30,7 @@ from hybridvo.core.results import (
     Status,
 )
 from hybridvo.core.stages import stage
-from hybridvo.tracking.calibration import (
+from hybridvo.objects.calibration import (
     FIRST_LOG_ODDS,
     HIDDEN_STEP,
     LARGE_OBJECT,
@@ -43,7 +43,7 @@ from hybridvo.tracking.calibration import (
     SAME_DEPTH,
     TRACE_GAIN,
 )
-from hybridvo.tracking.object_motions import (
+from hybridvo.objects.motions import (
     MOST,
     Expected,
     Fit,
@@ -117,13 +117,6 @@ class Things:
         return replace(self, known=tuple(map(longer, self.known)))
 
 
-class Objects(NamedTuple):
-    """The objects after a frame, and what the step states of them."""
-
-    things: Things
-    seen: tuple[MovingObject, ...]
-
-
 class _Ahead(NamedTuple):
     """An object as it is expected in the current frame."""
 
@@ -137,22 +130,21 @@ class _Ahead(NamedTuple):
 
 @stage("objects")
 def after_step(
-    things: Things | None,
+    things: Things,
     view: GridView,
     frames: int,
     options: Options,
     seed: int = 0,
-) -> Objects:
-    """Return the objects after a frame whose camera motion is known.
+) -> tuple[Things, tuple[MovingObject, ...]]:
+    """Return the objects after a frame whose camera motion is known, and what its step states.
 
     Args:
-        things: before the frame; None: none are known.
+        things: before the frame.
         view: the frame, and those before it.
         frames: number of frames since the frame before of the view.
         options: the option tree.
         seed: of the search.
     """
-    things = things or Things()
     ahead = [_ahead(thing, view, frames) for thing in things.known]
     expected = [
         Expected(each.T_curr_prev, each.cells, each.thing.age < NEW_OBJECT_FRAMES)
@@ -184,7 +176,7 @@ def after_step(
             shown.append(_stated_hidden(hidden, each, view))
     order = np.argsort([-thing.log_odds for thing in known], kind="stable")
     kept = sorted(order[:MAX_OBJECTS], key=lambda k: known[k].id)
-    return Objects(
+    return (
         Things(tuple(known[k] for k in kept), next_id),
         tuple(shown[k] for k in kept if known[k].log_odds > 0),
     )
