@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from hybridvo.core import laboratory
-from hybridvo.core.belief import Belief, resized
+from hybridvo.core.belief import resized
 from hybridvo.core.errors import InputError, did_you_mean
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
@@ -41,8 +41,8 @@ from hybridvo.evidence.one_time import (
     rough_motion,
 )
 from hybridvo.evidence.pair import FlowEvidence, PairEvidence, check_images
+from hybridvo.evidence.remembered import Remembered
 from hybridvo.flow.providers import FlowProvider, have_texture, with_flow
-from hybridvo.hypotheses.direct import PRIOR_COVARIANCE, Aligned, align_images
 from hybridvo.hypotheses.generate import static_grid
 from hybridvo.hypotheses.select import (
     Ranking,
@@ -55,6 +55,7 @@ from hybridvo.judge.probability import probability_of, surest_evidence
 from hybridvo.judge.verdict import believed, judge
 from hybridvo.network.models import Models, default_models
 from hybridvo.solver import refine_flow as refinement
+from hybridvo.solver.align import PRIOR_COVARIANCE, Aligned, align_images
 from hybridvo.solver.depth_alone import follow_depth
 from hybridvo.solver.depths import compare_depths
 from hybridvo.solver.refine_images import refine_photometric
@@ -90,7 +91,7 @@ class Context:
         expected: MotionPrior | None = None,
         weights: np.ndarray | None = None,
         start: np.ndarray | None = None,
-        remember: Callable[[], Belief] | None = None,
+        remembered: Remembered | None = None,
         near: np.ndarray | None = None,
     ) -> PairEvidence:
         """What can be measured of a pair."""
@@ -102,7 +103,7 @@ class Context:
             weights,
             start,
             self.seed,
-            remember,
+            remembered,
             near,
         )
 

@@ -43,8 +43,6 @@ from hybridvo.core.types import FramePair
 from hybridvo.evidence.pair import PairEvidence
 from hybridvo.flow.providers import with_flow
 from hybridvo.hypotheses.cues import Cues, compute_cues
-from hybridvo.hypotheses.direct import align_images
-from hybridvo.hypotheses.direct_evidence import RememberedEvidence
 from hybridvo.hypotheses.select import (
     cue_candidates,
     to_hypotheses,
@@ -53,6 +51,8 @@ from hybridvo.io.data.truth import true_motion
 from hybridvo.judge.calibration import CERTAINTY_BONUS, DIRECT_PROBABILITY
 from hybridvo.network.models import Models
 from hybridvo.pipeline import Context, by_flow, run_method, sure_alignment
+from hybridvo.solver.align import align_images
+from hybridvo.solver.aligned_points import RememberedEvidence
 from hybridvo.tracking.memory import carried_to
 from hybridvo_lab.calibration import WRONG_PX
 from hybridvo_lab.synthetic.noise_scenarios import SCENARIOS, make_pair
@@ -499,7 +499,7 @@ def fit_direct(
     """Weights of the two probabilities whose product is that of a direct motion.
 
     Args:
-        evidence: (N, k), see :class:`hybridvo.hypotheses.direct_evidence.DirectEvidence`.
+        evidence: (N, k), see :class:`hybridvo.solver.aligned_points.DirectEvidence`.
         certainty: (N,) log odds of the belief that was asked, NO_BELIEF where none was.
         right: (N,) bool.
         counts: (N,) by how much each answer counts.

@@ -25,6 +25,7 @@ from measuring import parser_of
 
 import hybridvo
 from hybridvo import Frame, Odometry
+from hybridvo.tracking.tracker_state import TrackerState
 from hybridvo_lab.synthetic.scenes import make_scene
 
 PACKAGE = Path(hybridvo.__file__).parent
@@ -37,7 +38,8 @@ class Found(NamedTuple):
     """A frame that shows one kind of walk."""
 
     kind: str
-    tracker: Odometry  # before the frame
+    tracker: Odometry
+    state: TrackerState  # before the frame
     frame: Frame
 
 
@@ -48,11 +50,12 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     made: Counter[str] = Counter()
     for found in frames_of_each_kind():
-        calls = calls_of(lambda found=found: track(found))
+        calls = calls_of(track_again(found))
         walk = list(dict.fromkeys(calls))
         count_records(made)
+        again = track_again(found)
         made.clear()
-        track(found)
+        again()
         print(line(found.kind, walk, len(calls), made))
         if args.list:
             print("\n".join(walk))
@@ -80,16 +83,20 @@ def frames_of_each_kind() -> Iterator[Found]:
             if kind not in shown and not is_early:
                 shown.add(kind)
                 tracker.resume(state)
-                yield Found(kind, tracker, frames[index])
+                yield Found(kind, tracker, state, frames[index])
             tracker.resume(after)
 
 
-def track(found: Found) -> None:
-    """Track the frame; the tracker is as before afterwards."""
-    state = found.tracker.state
+def track_again(found: Found) -> Callable[[], None]:
+    """Return what tracks the frame, after the tracker was set back to before it."""
+    found.tracker.resume(found.state)
     # a copy: what is kept with a frame must be worked out again
-    found.tracker.track(replace(found.frame))
-    found.tracker.resume(state)
+    frame = replace(found.frame)
+
+    def work() -> None:
+        found.tracker.track(frame)
+
+    return work
 
 
 def calls_of(work: Callable[[], None]) -> list[str]:

@@ -90,10 +90,15 @@ def grid_index(shape: tuple[int, int], points: int = POINTS) -> np.ndarray:
     (60, 80, 2)
     """
     height, width = shape
-    step = max(1, round(np.sqrt(height * width / points)))
+    step = grid_step(shape, points)
     first = step // 2
     rows, columns = np.mgrid[first:height:step, first:width:step]
     return np.stack([rows, columns], axis=-1)
+
+
+def grid_step(shape: tuple[int, int], points: int) -> int:
+    """Return the distance, px, between the pixels of :func:`grid_index`."""
+    return max(1, round(np.sqrt(shape[0] * shape[1] / points)))
 
 
 def resized(grid: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

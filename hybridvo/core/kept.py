@@ -1,4 +1,4 @@
-"""What is computed of a frame once, and kept as long as the frame."""
+"""What is computed of a frame or a pair once, and kept as long as it."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from weakref import WeakKeyDictionary
 
 from hybridvo.core.types import Frame
 
+Owner = TypeVar("Owner")
 Kept = TypeVar("Kept")
 
 
-class kept_with_frame(Generic[Kept]):
-    """Compute something of a frame once, and keep it as long as the frame.
+class kept_with(Generic[Owner, Kept]):
+    """Compute something of an object once, and keep it as long as the object.
 
     Args:
-        compute: what is kept, from a frame that is not changed.
+        compute: what is kept, from an object that is not changed.
 
     >>> from hybridvo.core.types import Camera
-    >>> @kept_with_frame
+    >>> @kept_with
     ... def rows(frame):
     ...     print("computed")
     ...     return frame.camera.height
@@ -29,17 +30,21 @@ class kept_with_frame(Generic[Kept]):
     (6, 6)
     """
 
-    def __init__(self, compute: Callable[[Frame], Kept]) -> None:
+    def __init__(self, compute: Callable[[Owner], Kept]) -> None:
         self._compute = compute
-        self._kept: WeakKeyDictionary[Frame, Kept] = WeakKeyDictionary()
+        self._kept: WeakKeyDictionary[Owner, Kept] = WeakKeyDictionary()
         functools.update_wrapper(self, compute)
 
-    def __call__(self, frame: Frame) -> Kept:
-        """Return what belongs to a frame."""
-        if frame not in self._kept:
-            self._kept[frame] = self._compute(frame)
-        return self._kept[frame]
+    def __call__(self, owner: Owner) -> Kept:
+        """Return what belongs to an object."""
+        if owner not in self._kept:
+            self._kept[owner] = self._compute(owner)
+        return self._kept[owner]
 
-    def keep(self, frame: Frame, value: Kept) -> None:
+    def keep(self, owner: Owner, value: Kept) -> None:
         """Keep what was computed elsewhere."""
-        self._kept[frame] = value
+        self._kept[owner] = value
+
+
+class kept_with_frame(kept_with[Frame, Kept]):
+    """The same of a frame."""

@@ -18,3 +18,10 @@ turned windows; ``tools/benchmark.py wide_steps``). It saves 350 ms of a step th
 NEGLIGIBLE_SHIFT_PX = 0.05
 """By how much the times of the rows must move some pixel, px, or the image stays as it is: below
 the noise of a motion by images."""
+
+# What is remembered
+
+HANDED_OVER = 0.9
+"""Factor on the log odds of a surface that the next keyframe sees as well."""
+SEEN_THROUGH_LOG_ODDS = -1.5
+"""Log odds of what stands where the keyframe before saw farther."""

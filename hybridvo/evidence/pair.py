@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.evidence.calibration import MIN_FLOW_COVERAGE
+from hybridvo.evidence.remembered import Remembered, carried_belief
 from hybridvo.flow.providers import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.matches import GuidedFlow, matched_motions
@@ -32,7 +33,7 @@ class PairEvidence:
         start: (4, 4) ``T_curr_prev`` near which the motion is, where that is known.
         seed: of the random samples.
         near: (4, 4) the motion as the most reduced images show it, where they were followed.
-        remember: what earlier frames have shown of the first frame's pixels; None: nothing.
+        remembered: what earlier frames have shown; None: nothing.
     """
 
     pair: FramePair
@@ -42,13 +43,14 @@ class PairEvidence:
     weights: np.ndarray | None = None
     start: np.ndarray | None = None
     seed: int = 0
-    remember: Callable[[], Belief] | None = None
+    remembered: Remembered | None = None
     near: np.ndarray | None = None
 
     @cached_property
     def belief(self) -> Belief | None:
         """Which pixels of the first frame are static; None where nothing is remembered."""
-        return None if self.remember is None else self.remember()
+        known = self.remembered
+        return None if known is None else carried_belief(known, self.pair.prev)
 
     @property
     def ready_belief(self) -> Belief | None:

@@ -11,7 +11,8 @@ import numpy as np
 
 from hybridvo.compiled.numba_tools import as_contiguous, njit
 from hybridvo.core.kept import kept_with_frame
-from hybridvo.core.types import Camera, Frame
+from hybridvo.core.types import Frame
+from hybridvo.core.unchecked import changed
 
 # Standard deviation of the blur of both images, px.
 IMAGE_BLUR_PX = 1.0
@@ -99,7 +100,8 @@ def _reduce(frame: Frame, factor: int) -> Frame:
     K = frame.camera
     # the centre of the first block is the pixel (factor - 1) / 2
     first = (factor - 1) / 2
-    camera = Camera(
+    camera = changed(
+        K,
         fx=K.fx / factor,
         fy=K.fy / factor,
         cx=(K.cx - first) / factor,
@@ -107,7 +109,9 @@ def _reduce(frame: Frame, factor: int) -> Frame:
         height=height,
         width=width,
     )
-    small = Frame(None, depth, camera)
+    small = changed(
+        frame, rgb=None, depth=depth, camera=camera, depth_variance=None, mask=None
+    )
     larger = grey(reduced(frame, factor // 2))
     averaged = cv2.resize(
         larger[: 2 * height, : 2 * width],

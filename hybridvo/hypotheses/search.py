@@ -8,6 +8,7 @@ removed before the next round.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +65,7 @@ REFERENCE_WIDTH = 1024
 COMPARED_STRIDE = 7
 
 
+POSE_OF = attrgetter("pose")
 Proposals = Mapping[MotionSource, np.ndarray]
 """Poses (N, 3, 4) of each kind, which compete in a round."""
 
@@ -151,7 +153,8 @@ class _Search:
         self.grid = grid
         self.K = grid.K
         self.cutoff = options.refine.cutoff
-        self.samples, self.h, self.w, _ = grid.sampled(options.search.grid_pixels)
+        self.samples, shape = grid.sampled(options.search.grid_pixels)
+        self.h, self.w, _ = shape
         self.n = self.h * self.w
         self.inverse_depth = robust_fit.translation_scale(self.samples, self.n)
         self.rng = np.random.default_rng(seed)
@@ -275,7 +278,7 @@ class _Search:
 
 def is_new(grid: PixelGrid, pose: np.ndarray, motions: Sequence[Candidate]) -> bool:
     """Whether a pose (3, 4) differs from each of the motions."""
-    poses = [pose, *(motion.pose for motion in motions)]
+    poses = [pose, *map(POSE_OF, motions)]
     others = distances(grid, poses, 0)[1:]
     return bool((others > DISTINCT_MOTION_PX).all())
 

@@ -28,7 +28,7 @@ believed."""
 DIRECT_EXACT = (-3.38, 2.05, -3.62, -0.61, -18.73)
 DIRECT_OF_SCENE = (-1.76, 0.13)
 """Of a motion found without flow: that it is the motion of one thing, in the evidence of
-:class:`hybridvo.hypotheses.direct_evidence.DirectEvidence`, and that the thing is the scene, in the
+:class:`hybridvo.solver.aligned_points.DirectEvidence`, and that the thing is the scene, in the
 last of it alone. Their product is fitted, and the first with the certainty of a belief where that
 was asked (``tools/calibrate.py --direct --pairs 24``): 5373 of 6712 right, where right is an error
 of less than a quarter of a pixel of 320 columns, or of three times that of a fit to the true static

@@ -35,10 +35,12 @@ from hybridvo.solver.calibration import (
     MIN_TEXTURED_PIXELS,
 )
 from hybridvo.solver.coarse_images import follow_images
-from hybridvo.solver.image_factor import ImageFactor, ImagesAt
+from hybridvo.solver.image_factor import ImageFactor
+from hybridvo.solver.image_kernels import ImagesAt
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import positive_inverse
-from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
+from hybridvo.solver.plane_kernels import PlanesAt
+from hybridvo.solver.planes import determined_step, planes_of
 from hybridvo.solver.rows import PlaneRow
 
 # Robust weight of a pixel that an answer takes for static.
@@ -162,8 +164,8 @@ def by_images_alone(
         T, gain_offset = images.follow(there, [], T, IMAGE_STEPS)
         there = images.at(T, gain_offset, there.noise)
     here = images.at(start, there.gain_offset, there.noise)
-    covariance = positive_inverse(there.information)
-    return ByImages(T, covariance, _match(there), _match(here))
+    covariance = positive_inverse(there.information.matrix)
+    return ByImages(T, covariance, _match(images, there), _match(images, here))
 
 
 def disagreement(motion: Motion, images: ByImages) -> Finding | None:
@@ -223,9 +225,9 @@ def _against(
     return None
 
 
-def _match(images: ImagesAt) -> ImageMatch:
-    grey_noise = float(images.noise[0])
-    return ImageMatch(grey_noise, images.correlation, images.in_view)
+def _match(images: ImageFactor, at: ImagesAt) -> ImageMatch:
+    grey_noise = float(at.noise[0])
+    return ImageMatch(grey_noise, images.correlation(at), images.in_view(at))
 
 
 def contradiction_by_depth(
@@ -249,7 +251,9 @@ def contradiction_by_depth(
     static_ratio = float(np.mean(motion.weights[::8, ::8] >= CONSISTENT_WEIGHT))
     points = int(DEPTH_POINTS / max(static_ratio, LEAST_STATIC_RATIO))
     options = options or RefineOptions()
-    planes = PlaneFactor(pair, motion.weights, CONSISTENT_WEIGHT, options, points)
+    planes = planes_of(pair, points).weighted(
+        motion.weights, CONSISTENT_WEIGHT, options
+    )
     start = np.ascontiguousarray(motion.T_curr_prev)
     T = start
     at_start = planes.at(start)
@@ -267,7 +271,7 @@ def contradiction_by_depth(
     if not at.determine_motion:
         return None
     step = se3_log(T @ invert(start))
-    stds = float(np.sqrt(max(step @ at.information @ step, 0.0)))
+    stds = float(np.sqrt(max(step @ at.information.matrix @ step, 0.0)))
     before = _median_residual(at_start)
     fits_better = before > DEPTH_LEAD_GAIN * _median_residual(at)
     lead = CLEAR_DEPTH_LEAD if fits_better else DEPTH_LEAD

@@ -14,8 +14,6 @@ import numpy as np
 from scipy.special import expit
 
 from hybridvo.core.results import Motion
-from hybridvo.hypotheses.direct import Aligned
-from hybridvo.hypotheses.direct_evidence import DirectEvidence, RememberedEvidence
 from hybridvo.hypotheses.select import ChoiceEvidence, CueEvidence
 from hybridvo.judge.calibration import (
     CERTAINTY_BONUS,
@@ -26,6 +24,8 @@ from hybridvo.judge.calibration import (
     DIRECT_PROBABILITY,
     WITHOUT_IMAGES_RIGHT,
 )
+from hybridvo.solver.align import Aligned
+from hybridvo.solver.aligned_points import DirectEvidence, RememberedEvidence
 from hybridvo.solver.depth_alone import DepthEvidence
 
 
@@ -78,7 +78,7 @@ def direct_probability(evidence: DirectEvidence) -> float:
     It must be the motion of one thing and not one between those of several; and the thing must be
     the scene.
 
-    >>> from hybridvo.hypotheses.direct_evidence import direct_evidence
+    >>> from hybridvo.solver.aligned_points import direct_evidence
     >>> turning_camera = direct_evidence(0.0002, 0.05, 1.0, 0.1)
     >>> round(direct_probability(turning_camera), 2)
     0.97

@@ -14,12 +14,12 @@ from hybridvo.core.depth_units import depth_unit_warning
 from hybridvo.core.results import Motion, Reason, RelativePose, Status
 from hybridvo.core.stages import stage
 from hybridvo.evidence.pair import PairEvidence
-from hybridvo.hypotheses.direct_evidence import DirectEvidence, RememberedEvidence
 from hybridvo.judge.calibration import DIRECT_INFLATION, NO_MOTION_PROBABILITY
 from hybridvo.judge.consistency import against_images_and_depth
 from hybridvo.judge.false_depth import false_depth
 from hybridvo.judge.findings import Finding, improbable, others_possible
 from hybridvo.judge.probability import probability_of
+from hybridvo.solver.aligned_points import DirectEvidence, RememberedEvidence
 
 NO_SEARCH = Status.degraded(
     Reason.AMBIGUOUS_MOTION,

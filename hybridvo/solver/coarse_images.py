@@ -10,11 +10,12 @@ import numpy as np
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import MotionPrior
 from hybridvo.core.types import FramePair
+from hybridvo.core.unchecked import changed
 from hybridvo.flow.frame_images import blurred, reduced
 from hybridvo.solver.image_factor import ImageFactor
 from hybridvo.solver.images import choose_pixels
 from hybridvo.solver.newton import Factor, Linearization, positive_inverse
-from hybridvo.solver.planes import PlaneFactor
+from hybridvo.solver.planes import WeightedPlanes
 from hybridvo.solver.prior import Prior
 
 # reductions of the images, coarse to fine, and the smallest side of a reduced
@@ -34,7 +35,7 @@ def follow_images(
     pair: FramePair,
     T: np.ndarray,
     weights: np.ndarray,
-    planes: PlaneFactor | None,
+    planes: WeightedPlanes | None,
     options: RefineOptions,
     is_near: bool = False,
 ) -> tuple[np.ndarray, float]:
@@ -126,4 +127,5 @@ def _reduced_images(
     index = choose_pixels(blurred(prev), depth, small_weights, count)
     if not len(index):
         return None
-    return ImageFactor(FramePair(prev, curr, None), small_weights, index, options)
+    small = changed(pair, prev=prev, curr=curr, flow=None)
+    return ImageFactor(small, small_weights, index, options)

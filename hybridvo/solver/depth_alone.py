@@ -20,7 +20,8 @@ from hybridvo.core.types import FramePair
 from hybridvo.solver.calibration import MIN_FOLLOWING, MIN_STATIC_WEIGHT
 from hybridvo.solver.covariance import covariance_of_sources
 from hybridvo.solver.newton import ROBUST_CURVATURE
-from hybridvo.solver.planes import PlaneFactor, PlanesAt, determined_step
+from hybridvo.solver.plane_kernels import PlanesAt
+from hybridvo.solver.planes import WeightedPlanes, determined_step, planes_of
 from hybridvo.solver.rows import PlaneRow
 
 # Gauss-Newton steps from the expected motion at most, and the length of the last one in standard
@@ -90,7 +91,7 @@ def follow_depth(
     if weights is None:
         weights = np.ones(pair.prev.camera.shape, np.float32)
     options = options or RefineOptions()
-    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT, options)
+    planes = planes_of(pair).weighted(weights, MIN_STATIC_WEIGHT, options)
     prior = np.linalg.inv(expected.covariance)
     T = expected.T_curr_prev
     for _ in range(STEPS):
@@ -115,7 +116,7 @@ def follow_depth(
 
 def _seen(
     pair: FramePair,
-    planes: PlaneFactor,
+    planes: WeightedPlanes,
     at: PlanesAt,
     known: MotionPrior,
     information: np.ndarray,

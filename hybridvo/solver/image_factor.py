@@ -8,7 +8,6 @@ information.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ from hybridvo.solver.correlated_errors import view_of
 from hybridvo.solver.image_kernels import (
     GREY_NOISE_FLOOR,
     ComparedImages,
+    ImagesAt,
     compare_images,
     fill_pixels,
     sum_images,
@@ -47,56 +47,6 @@ IMAGE_TOLERANCE = 0.1
 
 # guards a division where no pixel has weight
 TINY = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class ImagesAt:
-    """Differences of the images at the pixels of a factor, at one motion.
-
-    Attributes:
-        gain_offset: (2,) gain of the current image over the previous one, offset in
-            grey levels.
-        noise: (2,) standard deviations: of the residual, grey levels; of the typical log depth.
-        rows: (12, N) residuals and derivatives, see :class:`ImageRow`.
-        weights: (N,) robust weights, in units of information.
-        pixels: (8, N) what is known of the pixels, see :class:`PixelRow`.
-        information: (6, 6) of the motion.
-        information_scale: factor that makes the normal equations state about as much.
-        agreement: factor in (0, 1] by which parts of the image that disagree
-            lowered the information.
-    """
-
-    gain_offset: np.ndarray
-    noise: np.ndarray
-    rows: np.ndarray
-    weights: np.ndarray
-    pixels: np.ndarray
-    information: np.ndarray
-    information_scale: float
-    agreement: float
-
-    @property
-    def in_view(self) -> float:
-        """Fraction of the weight that falls inside the current image."""
-        weight = self.pixels[PixelRow.WEIGHT]
-        weight_in_view = weight[self.weights > 0].sum()
-        return float(weight_in_view / max(weight.sum(), TINY))
-
-    @property
-    def correlation(self) -> float:
-        """Weighted correlation of the images where visible; 0 if one is constant."""
-        seen = self.weights > 0
-        gain, offset = self.gain_offset
-        weight = self.pixels[PixelRow.WEIGHT][seen]
-        grey_prev = self.pixels[PixelRow.GREY][seen]
-        residual = self.rows[ImageRow.RESIDUAL][seen]
-        grey_curr = residual + gain * grey_prev + offset
-        a = _centred(grey_prev, weight)
-        b = _centred(grey_curr, weight)
-        power = float(np.sum(weight * a * a)) * float(np.sum(weight * b * b))
-        if power <= 0:
-            return 0.0
-        return float(np.sum(weight * a * b)) / np.sqrt(power)
 
 
 class ImageFactor:
@@ -141,17 +91,17 @@ class ImageFactor:
             at.noise,
             np.empty_like(at.rows),
             np.empty_like(at.weights),
-            at.information_scale,
+            at.information.scale,
         )
 
     def first(self, T_curr_prev: np.ndarray) -> ImagesAt:
         """Return what the images show at a first motion (4, 4), where no gain is known yet."""
         grey_noise = np.array([GREY_NOISE_FLOOR, self._depth_noise], np.float32)
         # twice: the noise is that under the gain and offset of the first time
-        before = weigh_images(
+        _, _, gain_offset, noise, _ = weigh_images(
             self._images, T_curr_prev, UNCHANGED_LIGHT, grey_noise
         )
-        return self.at(T_curr_prev, before.gain_offset, before.noise)
+        return self.at(T_curr_prev, gain_offset, noise)
 
     def at(
         self, T_curr_prev: np.ndarray, gain_offset: np.ndarray, noise: np.ndarray
@@ -163,17 +113,31 @@ class ImageFactor:
             gain_offset: (2,) gain and offset so far.
             noise: (2,) standard deviations so far.
         """
-        found = compare_images(self._images, T_curr_prev, gain_offset, noise)
-        return ImagesAt(
-            gain_offset=found.gain_offset,
-            noise=found.noise,
-            rows=found.rows,
-            weights=found.weights,
-            pixels=self._images.pixels,
-            information=found.information.matrix,
-            information_scale=found.information.scale,
-            agreement=found.information.agreement,
+        found: ImagesAt = compare_images(
+            self._images, T_curr_prev, gain_offset, noise
         )
+        return found
+
+    def in_view(self, at: ImagesAt) -> float:
+        """Fraction of the weight that falls inside the current image."""
+        weight = self._images.pixels[PixelRow.WEIGHT]
+        weight_in_view = weight[at.weights > 0].sum()
+        return float(weight_in_view / max(weight.sum(), TINY))
+
+    def correlation(self, at: ImagesAt) -> float:
+        """Weighted correlation of the images where visible; 0 if one is constant."""
+        seen = at.weights > 0
+        gain, offset = at.gain_offset
+        weight = self._images.pixels[PixelRow.WEIGHT][seen]
+        grey_prev = self._images.pixels[PixelRow.GREY][seen]
+        residual = at.rows[ImageRow.RESIDUAL][seen]
+        grey_curr = residual + gain * grey_prev + offset
+        a = _centred(grey_prev, weight)
+        b = _centred(grey_curr, weight)
+        power = float(np.sum(weight * a * a)) * float(np.sum(weight * b * b))
+        if power <= 0:
+            return 0.0
+        return float(np.sum(weight * a * b)) / np.sqrt(power)
 
     def follow(
         self,

@@ -60,24 +60,16 @@ class ComparedImages(NamedTuple):
     places: Tiling  # where the pixels lie in the previous image
 
 
-class Differences(NamedTuple):
+class ImagesAt(NamedTuple):
     """Differences of two images at one motion, under the gain and offset that fit there."""
 
-    rows: np.ndarray  # (12, N) float32, see ImageRow
+    rows: np.ndarray  # (12, N) float32 residuals and derivatives, see ImageRow
     weights: np.ndarray  # (N,) float32 robust weights, in units of information
-    gain_offset: np.ndarray  # (2,)
-    noise: np.ndarray  # (2,) float32, see weigh_pixels
-    information: Information
-
-
-class Weighed(NamedTuple):
-    """The same, and the normal equations in place of the information."""
-
-    rows: np.ndarray
-    weights: np.ndarray
+    # (2,) gain of the current image over the previous one, offset in grey levels
     gain_offset: np.ndarray
+    # (2,) float32 standard deviations: of the residual, grey levels; of the typical log depth
     noise: np.ndarray
-    products: np.ndarray  # (9, 9)
+    information: Information
 
 
 # -- selection of pixels -----------------------------------------------------------
@@ -352,7 +344,7 @@ def weigh_pixels(pixels, noise, squared_cutoff, rows, weights):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def compare_images(images, T, gain_offset, noise):
-    """Return the :class:`Differences` of two images at a motion.
+    """Return the :class:`ImagesAt` of two images at a motion.
 
     Args:
         images: an :class:`ComparedImages`.
@@ -360,30 +352,31 @@ def compare_images(images, T, gain_offset, noise):
         gain_offset: (2,) gain and offset so far.
         noise: (2,) float32 standard deviations so far, see :func:`weigh_pixels`.
     """
-    weighed = weigh_images(images, T, gain_offset, noise)
+    rows, weights, gain_offset, noise, products = weigh_images(
+        images, T, gain_offset, noise
+    )
     # px along each axis of the image
-    shift = np.float32(SHARED_SHIFT * weighed.noise[0] / images.contrast)
+    shift = np.float32(SHARED_SHIFT * noise[0] / images.contrast)
     gradient = images.pixels[PixelRow.GRADIENT_X : PixelRow.GRADIENT_Y + 1]
     information = estimate_information(
-        weighed.rows[:IMAGE_TERMS],
-        weighed.weights,
+        rows[:IMAGE_TERMS],
+        weights,
         shift * gradient,
-        weighed.products,
+        products,
         images.places,
         EVEN_PARTS,
     )
-    return Differences(
-        weighed.rows,
-        weighed.weights,
-        weighed.gain_offset,
-        weighed.noise,
-        information,
-    )
+    return ImagesAt(rows, weights, gain_offset, noise, information)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def weigh_images(images, T, gain_offset, noise):
-    """Linearize, estimate the noise, then gain and offset under it: a :class:`Weighed`."""
+    """Linearize, estimate the noise, then gain and offset under it.
+
+    Returns:
+        Rows, weights, gain and offset, and noise as in :class:`ImagesAt`, and the sums (9, 9) of
+        the weighted products of the rows.
+    """
     count = images.pixels.shape[1]
     rows = np.empty((IMAGE_ROWS, count), np.float32)
     weights = np.empty(count, np.float32)
@@ -399,7 +392,7 @@ def weigh_images(images, T, gain_offset, noise):
     add_products(rows[:IMAGE_TERMS], weights, 1.0, products)
     change = fitting_change(products, gain_offset)
     shift_residuals(rows, products, change)
-    return Weighed(rows, weights, gain_offset + change, noise, products)
+    return rows, weights, gain_offset + change, noise, products
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -102,12 +102,14 @@ class FactorSum:
 
     def linearize(self, state: MotionState) -> Linearization:
         """Return the normal equations of all factors at a state."""
-        first, *others = (factor.linearize(state) for factor in self._factors)
-        H = first.H.copy()
-        g = first.g.copy()
-        curvature = first.curvature.copy()
-        cost = first.cost
-        for part in others:
+        first, *others = self._factors
+        at = first.linearize(state)
+        H = at.H.copy()
+        g = at.g.copy()
+        curvature = at.curvature.copy()
+        cost = at.cost
+        for factor in others:
+            part = factor.linearize(state)
             add_equations(part.H, part.g, part.curvature, H, g, curvature)
             cost += part.cost
         return Linearization(H, g, cost, curvature)
@@ -129,13 +131,6 @@ class NewtonResult(Generic[L_co]):
     at: L_co
     iterations: int
     last2: float
-
-
-class _Step(NamedTuple):
-    """A Newton step."""
-
-    delta: np.ndarray  # (N,)
-    length2: float  # squared length in standard deviations; infinite where there is no step
 
 
 def newton(
@@ -169,34 +164,37 @@ def newton(
     state = start
     damping = DAMPING
     at = factor.linearize(state)
-    step = _step(at, damping)
+    delta, length2 = _step(at, damping)
     is_kept = True
     for iteration in range(iterations):
-        if not math.isfinite(step.length2):
-            return NewtonResult(state, at, iteration, step.length2)
-        ahead = state.moved(step.delta)
-        if step.length2 < tolerance**2:
-            return NewtonResult(ahead, at, iteration, step.length2)
+        if not math.isfinite(length2):
+            return NewtonResult(state, at, iteration, length2)
+        ahead = state.moved(delta)
+        if length2 < tolerance**2:
+            return NewtonResult(ahead, at, iteration, length2)
         candidate = factor.linearize(ahead)
-        following = _step(candidate, lowered(damping))
+        following, following2 = _step(candidate, lowered(damping))
         falls = candidate.cost <= at.cost
-        if falls or following.length2 < MAX_NEXT_STEP2 * step.length2:
+        if falls or following2 < MAX_NEXT_STEP2 * length2:
             state = ahead
             at = candidate
             damping = lowered(damping)
-            step = following
+            delta = following
+            length2 = following2
             is_kept = True
         else:
             damping = raised(damping)
-            step = _step(at, damping)
+            delta, length2 = _step(at, damping)
             is_kept = False
-    if is_kept and math.isfinite(step.length2):
-        state = state.moved(step.delta)
-    return NewtonResult(state, at, iterations, step.length2)
+    if is_kept and math.isfinite(length2):
+        state = state.moved(delta)
+    return NewtonResult(state, at, iterations, length2)
 
 
-def _step(at: Linearization, damping: float) -> _Step:
-    return _Step(*newton_step(at.H, at.curvature, at.g, damping))
+def _step(at: Linearization, damping: float) -> tuple[np.ndarray, float]:
+    """A step (N,) and its squared length in standard deviations, infinite where there is none."""
+    delta, length2 = newton_step(at.H, at.curvature, at.g, damping)
+    return delta, length2
 
 
 def positive_inverse(matrix: np.ndarray) -> np.ndarray | None:

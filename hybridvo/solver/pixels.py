@@ -40,27 +40,6 @@ class GridShape(NamedTuple):
     stride: int  # px between neighbours
 
 
-class SampledPixels(NamedTuple):
-    """A pixel buffer and the grid that it was filled from."""
-
-    samples: np.ndarray  # (BUFFER_ROWS, rows * columns or more)
-    rows: int
-    columns: int
-    stride: int  # px between neighbours
-
-
-class FullPass(NamedTuple):
-    """Sums over all pixels at one motion."""
-
-    # (rows, columns, 27) upper triangle of the Hessian, gradient of each tile
-    tiles: np.ndarray
-    cost: float  # robust cost
-    robust_sum: float  # sum of robust times external weights
-    external_sum: float  # external weights of all usable pixels
-    inlier_sum: float  # of those within the robust kernel's cutoff
-    weights: np.ndarray  # (H, W) float32 robust weights, without the external ones
-
-
 class PixelGrid:
     """The arrays of a pair as the kernels take them, and a coarse grid of its pixels.
 
@@ -102,21 +81,24 @@ class PixelGrid:
             stride=np.float32(1),
         )
         self.K = np.array([curr.fx, curr.fy, curr.cx, curr.cy], np.float32)
-        self.samples, *shape = self.sampled(pixels)
-        self.shape = GridShape(*shape)
+        self.samples, self.shape = self.sampled(pixels)
 
-    def sampled(self, pixels: int) -> SampledPixels:
-        """Return a grid of about ``pixels`` pixels, made finer where few of them are usable."""
+    def sampled(self, pixels: int) -> tuple[np.ndarray, GridShape]:
+        """Return a grid of about ``pixels`` pixels, made finer where few of them are usable.
+
+        Returns:
+            A pixel buffer (BUFFER_ROWS, n or more), and the grid that it was filled from.
+        """
         stride = grid_stride(self.size, pixels)
         while True:
-            sampled = self._sample(stride)
-            count = sampled.rows * sampled.columns
-            usable = np.count_nonzero(sampled.samples[kernels.W, :count] > 0)
+            samples, shape = self._sample(stride)
+            count = shape.rows * shape.columns
+            usable = np.count_nonzero(samples[kernels.W, :count] > 0)
             if usable >= MIN_USABLE_RATIO * pixels or stride == 1:
-                return sampled
+                return samples, shape
             stride //= 2
 
-    def _sample(self, stride: int) -> SampledPixels:
+    def _sample(self, stride: int) -> tuple[np.ndarray, GridShape]:
         """Return every ``stride``-th pixel in both directions."""
         first = stride // 2
         every = slice(first, None, stride)
@@ -130,11 +112,11 @@ class PixelGrid:
         )
         buffer = kernels.gather_all(PixelSource(maps, camera, self.scale))
         rows, columns = maps.depth.shape[:2]
-        return SampledPixels(buffer, rows, columns, stride)
+        return buffer, GridShape(rows, columns, stride)
 
     def full_pass(
         self, pose: np.ndarray, noise: ResidualNoise, tile: int
-    ) -> FullPass:
+    ) -> TileSums:
         """Sum the normal equations of all pixels.
 
         Args:
@@ -156,15 +138,7 @@ class PixelGrid:
             kernels.sum_tiles(source, pose, self.K, noise, first, last, tile, out)
 
         in_two_threads(work, rows)
-        totals = out.totals.sum(axis=0)
-        return FullPass(
-            out.tiles,
-            float(totals[kernels.COST]),
-            float(totals[kernels.ROBUST_SUM]),
-            float(totals[kernels.EXTERNAL_SUM]),
-            float(totals[kernels.INLIER_SUM]),
-            out.robust,
-        )
+        return out
 
     @property
     def count(self) -> int:

@@ -68,13 +68,28 @@ class Surfaces(NamedTuple):
     places: Tiling  # where the points lie in the previous image
 
 
-class Distances(NamedTuple):
-    """Distances of the points to the current surface, at one motion."""
+class PlanesAt(NamedTuple):
+    """Distances of the points of a factor to the current surface, at one motion."""
 
-    rows: np.ndarray  # (11, N) float32, see PlaneRow
+    rows: np.ndarray  # (11, N) float32 residuals and derivatives, see PlaneRow
     weights: np.ndarray  # (N,) float32 robust weights, in units of information
     noise_polynomial: np.ndarray  # (3,) float32, see weigh_points
     information: Information
+
+    @property
+    def determine_motion(self) -> bool:
+        """Whether enough points are visible on the current surface."""
+        return self.information.scale > 0
+
+    @property
+    def surface_depth(self) -> np.ndarray:
+        """(N,) depth of the surface that a point is visible on, metres; 0 where it is not."""
+        return np.asarray(self.rows[PlaneRow.SURFACE_DEPTH])
+
+    def noise(self, z: np.ndarray) -> np.ndarray:
+        """Return the fitted standard deviation (N,) at depths (N,), metres."""
+        a, b, c = self.noise_polynomial
+        return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -271,7 +286,7 @@ def non_negative(products, targets):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def compare_surfaces(surfaces, T):
-    """Return the :class:`Distances` of two depth maps at a motion (4, 4)."""
+    """Return the :class:`PlanesAt` of two depth maps at a motion (4, 4)."""
     count = len(surfaces.points)
     rows = np.zeros((PLANE_ROWS, count), np.float32)
     weights = np.zeros(count, np.float32)
@@ -282,7 +297,7 @@ def compare_surfaces(surfaces, T):
     surface_depth = rows[PlaneRow.SURFACE_DEPTH]
     seen = np.flatnonzero(surface_depth > ZERO)
     if len(seen) < MIN_PLANE_POINTS:
-        return Distances(rows, weights, polynomial, unknown)
+        return PlanesAt(rows, weights, polynomial, unknown)
     some = seen[::NOISE_STEP]
     polynomial[:] = fit_noise(
         surface_depth[some],
@@ -302,7 +317,7 @@ def compare_surfaces(surfaces, T):
     information = estimate_information(
         terms, weights, shared, products, surfaces.places, 0.0
     )
-    return Distances(rows, weights, polynomial, information)
+    return PlanesAt(rows, weights, polynomial, information)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)

@@ -8,15 +8,15 @@ information.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from hybridvo.compiled.numba_tools import as_contiguous
+from hybridvo.core.belief import POINTS, grid_step
 from hybridvo.core.geometry import valid_depth
-from hybridvo.core.kept import kept_with_frame
+from hybridvo.core.kept import kept_with, kept_with_frame
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.solver.calibration import MIN_EQUAL_DEPTHS, QUANTUM_PERCENTILE
@@ -28,7 +28,7 @@ from hybridvo.solver.newton import (
     robust_linearization,
 )
 from hybridvo.solver.plane_kernels import (
-    NOISE_FLOOR,
+    PlanesAt,
     Surfaces,
     compare_surfaces,
     sum_planes,
@@ -41,47 +41,10 @@ from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
 # do not determine a direction of the motion.
 MIN_DEPTH_EIGENVALUE = 1e-3
 
-# points on a regular grid, at most
-POINTS = 5000
 # of single precision, relative: what differs by less is equal
 ROUNDING = 1e-5
 # guards the scale of a direction that no point determines
 TINY = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class PlanesAt:
-    """Distances of the points of a factor to the current surface, at one motion.
-
-    Attributes:
-        rows: (11, N) residuals and derivatives, see :class:`PlaneRow`.
-        weights: (N,) robust weights, in units of information.
-        noise_polynomial: (3,) of the standard deviation of a distance at a depth.
-        information: (6, 6) of the motion; zero where too few points are visible.
-        information_scale: factor that makes the normal equations state about as much; 0 where
-            the depth maps do not determine the motion.
-    """
-
-    rows: np.ndarray
-    weights: np.ndarray
-    noise_polynomial: np.ndarray
-    information: np.ndarray
-    information_scale: float
-
-    @property
-    def determine_motion(self) -> bool:
-        """Whether enough points are visible on the current surface."""
-        return self.information_scale > 0
-
-    @property
-    def surface_depth(self) -> np.ndarray:
-        """(N,) depth of the surface that a point is visible on, metres; 0 where it is not."""
-        return self.rows[PlaneRow.SURFACE_DEPTH]
-
-    def noise(self, z: np.ndarray) -> np.ndarray:
-        """Return the fitted standard deviation (N,) at depths (N,), metres."""
-        a, b, c = self.noise_polynomial
-        return np.maximum(a + (b + c * z) * z, NOISE_FLOOR * z)
 
 
 class Structure(NamedTuple):
@@ -96,7 +59,58 @@ class Structure(NamedTuple):
 
 
 class PlaneFactor:
-    """Distances of moved points of the previous depth map to the current one.
+    """Two depth maps as a factor of the motion of their pair, before weights are handed to it.
+
+    Args:
+        pair: two frames; the previous one has depth.
+        max_points: about how many points there are at most.
+    """
+
+    def __init__(self, pair: FramePair, max_points: int) -> None:
+        self.grid = points_of(pair.prev, max_points)
+        self.size = pair.prev.camera.shape
+        camera = pair.curr.camera
+        self.camera = np.array(
+            [camera.fx, camera.fy, camera.cx, camera.cy], np.float32
+        )
+        self.depth = _current_depth(pair)
+        self.quantum = _quantum_of(pair.prev)
+
+    def weighted(
+        self, weights: np.ndarray, min_weight: float, options: RefineOptions
+    ) -> WeightedPlanes:
+        """Return the factor under weights.
+
+        Args:
+            weights: (H, W) static weights, from 0 to 1.
+            min_weight: smallest weight of a pixel that is used.
+            options: cutoff of the robust kernel, and number of tiles.
+        """
+        return WeightedPlanes(self, weights, min_weight, options)
+
+
+def planes_of(pair: FramePair, max_points: int = POINTS) -> PlaneFactor:
+    """Return the depth maps of a pair as a factor; it is made once, and lent to all.
+
+    Args:
+        pair: two frames; the previous one has depth.
+        max_points: about how many points there are at most.
+    """
+    factors = _factors(pair)
+    step = grid_step(pair.prev.camera.shape, max_points)
+    if step not in factors:
+        factors[step] = PlaneFactor(pair, max_points)
+    return factors[step]
+
+
+@kept_with
+def _factors(pair: FramePair) -> dict[int, PlaneFactor]:
+    """The factors that were made so far, by the step of their grid."""
+    return {}
+
+
+class WeightedPlanes:
+    """Distances of moved points of the previous depth map to the current one, under weights.
 
     Attributes:
         cells: (rows, columns) of the points on their regular grid.
@@ -106,37 +120,27 @@ class PlaneFactor:
 
     def __init__(
         self,
-        pair: FramePair,
+        factor: PlaneFactor,
         weights: np.ndarray,
         min_weight: float,
         options: RefineOptions,
-        max_points: int = POINTS,
     ) -> None:
-        """Choose the points of a pair.
-
-        Args:
-            pair: two frames; the previous one has depth.
-            weights: (H, W) static weights, from 0 to 1.
-            min_weight: smallest weight of a pixel that is used.
-            options: cutoff of the robust kernel, and number of tiles.
-            max_points: about how many points there are at most.
-        """
-        grid = points_of(pair.prev, max_points)
+        """Choose the points with enough weight; see :meth:`PlaneFactor.weighted`."""
+        grid = factor.grid
         weight = np.asarray(weights)[grid.pixels[:, 0], grid.pixels[:, 1]]
         used = weight >= min_weight
         self.cells = tuple(each[used] for each in grid.cells)
         self._grid_shape = grid.shape
         self.index = grid.pixels[used]
         self.points = grid.xyz[used]
-        camera = pair.curr.camera
         self._surfaces = Surfaces(
             self.points.astype(np.float32),
             weight[used].astype(np.float32),
-            _current_depth(pair),
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+            factor.depth,
+            factor.camera,
             float(options.cutoff),
-            _quantum_of(pair.prev),
-            view_of(pair.prev.camera.shape, self.index, options.tiles),
+            factor.quantum,
+            view_of(factor.size, self.index, options.tiles),
         )
 
     def under(self, at: PlanesAt) -> NoisyPlanes:
@@ -146,7 +150,7 @@ class PlaneFactor:
             at.noise_polynomial,
             np.empty_like(at.rows),
             np.empty_like(at.weights),
-            at.information_scale,
+            at.information.scale,
         )
 
     def on_grid(self, values: np.ndarray) -> np.ndarray:
@@ -157,14 +161,8 @@ class PlaneFactor:
 
     def at(self, T_curr_prev: np.ndarray) -> PlanesAt:
         """Return distances, noise and information at a motion (4, 4)."""
-        found = compare_surfaces(self._surfaces, T_curr_prev)
-        return PlanesAt(
-            found.rows,
-            found.weights,
-            found.noise_polynomial,
-            found.information.matrix,
-            found.information.scale,
-        )
+        found: PlanesAt = compare_surfaces(self._surfaces, T_curr_prev)
+        return found
 
     def structure(self, at: PlanesAt) -> Structure:
         """Return what neighbouring points show in common, apart from what is noise.
@@ -194,7 +192,7 @@ class PlaneFactor:
 
         def scaled(factors: np.ndarray) -> np.ndarray:
             M = back @ (factors * directions).T
-            return np.asarray(M @ at.information @ M.T)
+            return np.asarray(M @ at.information.matrix @ M.T)
 
         return Structure(scaled(np.sqrt(fractions)), scaled(fractions))
 

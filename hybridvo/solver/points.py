@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.core.belief import POINTS, grid_index
+from hybridvo.core.belief import POINTS, grid_index, grid_step
 from hybridvo.core.geometry import backproject, valid_depth
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Frame
@@ -56,14 +56,15 @@ def points_of(frame: Frame, count: int = POINTS) -> Points:
         count: about how many there are at most; by default those of a belief.
     """
     grids = _grids(frame)
-    if count not in grids:
-        grids[count] = _choose(frame, count)
-    return grids[count]
+    step = grid_step(frame.camera.shape, count)
+    if step not in grids:
+        grids[step] = _choose(frame, count)
+    return grids[step]
 
 
 @kept_with_frame
 def _grids(frame: Frame) -> dict[int, Points]:
-    """The points that were chosen so far, by how many were asked for."""
+    """The points that were chosen so far, by the step of their grid."""
     return {}
 
 

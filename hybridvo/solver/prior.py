@@ -16,15 +16,6 @@ from hybridvo.solver.rows import MOTION_TERMS
 NO_CURVATURE = np.zeros((MOTION_TERMS, MOTION_TERMS))
 
 
-class PriorAt(NamedTuple):
-    """What a prior states at a motion."""
-
-    information: np.ndarray  # (6, 6) under Student's kernel
-    g: np.ndarray  # (6,) negative gradient of the cost
-    cost: float
-    distance2: float  # squared, standard deviations
-
-
 class Prior(NamedTuple):
     """A motion with its covariance, under Student's kernel."""
 
@@ -36,16 +27,12 @@ class Prior(NamedTuple):
         """Return the prior of a motion (4, 4) with an information (6, 6)."""
         return cls(invert(T_curr_prev), information)
 
-    def at(self, T_curr_prev: np.ndarray) -> PriorAt:
-        """Return what it states at a motion (4, 4)."""
-        return PriorAt(
-            *prior_terms(self.T_prev_curr, self.information, T_curr_prev)
-        )
-
     def linearize(self, state: MotionState) -> Linearization:
-        """Return the normal equations at a state."""
-        at = self.at(state.T_curr_prev)
-        return Linearization(at.information, at.g, at.cost, NO_CURVATURE)
+        """Return the normal equations at a state, whose H is its information there."""
+        H, g, cost = prior_terms(
+            self.T_prev_curr, self.information, state.T_curr_prev
+        )
+        return Linearization(H, g, cost, NO_CURVATURE)
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -62,7 +49,7 @@ def tangent_from(T_prev_curr, T):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def prior_terms(T_prev_curr, information, T):
-    """Return information, negative gradient, cost and squared distance of a prior at a motion.
+    """Return information, negative gradient and cost of a prior at a motion.
 
     Args:
         T_prev_curr: (4, 4) inverse of the prior motion.
@@ -74,4 +61,4 @@ def prior_terms(T_prev_curr, information, T):
     robust = (PRIOR_FREEDOM + 6) / (PRIOR_FREEDOM + distance2)
     cost = 0.5 * (PRIOR_FREEDOM + 6) * np.log1p(distance2 / PRIOR_FREEDOM)
     H = robust * information
-    return H, -(H @ xi), cost, distance2
+    return H, -(H @ xi), cost

@@ -123,17 +123,19 @@ class FlowFactor:
         """Return the normal equations at a state."""
         sums = self.grid.full_pass(state.T_curr_prev[:3], self.noise, self.tile)
         total = sums.tiles.sum(axis=(0, 1))
+        totals = sums.totals.sum(axis=0)
+        external_sum = float(totals[kernels.EXTERNAL_SUM])
         return FlowLinearization(
             H=symmetric(total[:HESSIAN_SUMS]),
             g=total[HESSIAN_SUMS:],
-            cost=sums.cost,
-            curvature=symmetric(self.scores.curvature * sums.external_sum),
-            meat=symmetric(self.scores.meat * sums.external_sum),
+            cost=float(totals[kernels.COST]),
+            curvature=symmetric(self.scores.curvature * external_sum),
+            meat=symmetric(self.scores.meat * external_sum),
             tiles=sums.tiles,
-            robust_sum=sums.robust_sum,
-            external_sum=sums.external_sum,
-            inlier_sum=sums.inlier_sum,
-            weights=sums.weights,
+            robust_sum=float(totals[kernels.ROBUST_SUM]),
+            external_sum=external_sum,
+            inlier_sum=float(totals[kernels.INLIER_SUM]),
+            weights=sums.robust,
         )
 
 
@@ -210,10 +212,10 @@ def _coarse_motion(
     pose = np.array(start.T_curr_prev[:3], np.float64)
     if start.noise is not None:
         return pose, start.noise, start.iterations
-    fit = robust_fit.fit_coarse(
+    fitted, noise, _, iterations = robust_fit.fit_coarse(
         grid.samples, grid.count, grid.K, pose, options.cutoff
     )
-    return fit.pose, fit.noise, fit.iterations
+    return fitted, noise, iterations
 
 
 def _fit_full_grid(

@@ -7,7 +7,6 @@ equations of prior, images and depth maps add up.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,10 +22,12 @@ from hybridvo.solver.calibration import (
     MIN_TEXTURED_PIXELS,
 )
 from hybridvo.solver.covariance import covariance_of_sources
-from hybridvo.solver.image_factor import ImageFactor, ImagesAt
+from hybridvo.solver.image_factor import ImageFactor
+from hybridvo.solver.image_kernels import ImagesAt
 from hybridvo.solver.images import choose_pixels
-from hybridvo.solver.newton import positive_inverse
-from hybridvo.solver.planes import PlaneFactor, PlanesAt
+from hybridvo.solver.newton import MotionState, positive_inverse
+from hybridvo.solver.plane_kernels import PlanesAt
+from hybridvo.solver.planes import WeightedPlanes, planes_of
 from hybridvo.solver.prior import Prior
 
 # Standard deviations by which a round of the photometric refinement moves the motion at least, or
@@ -79,22 +80,20 @@ def refine_photometric(
 
     prior = Prior.around(pose.T_curr_prev, flow_information)
     images = ImageFactor(pair, weights, index, options, pose.depth_noise)
-    planes = PlaneFactor(pair, weights, MIN_STATIC_WEIGHT, options)
-    there = _follow(images, planes, prior, pose.T_curr_prev)
-
-    T = there.T_curr_prev
-    stated = prior.at(T)
+    planes = planes_of(pair).weighted(weights, MIN_STATIC_WEIGHT, options)
+    T, by_images, by_planes = _follow(images, planes, prior, pose.T_curr_prev)
+    information = by_images.information.matrix
     joint_covariance = covariance_of_sources(
-        stated.information, there.images.information, there.planes.information
+        prior.linearize(MotionState(T)).H, information, by_planes.information.matrix
     )
     report = PhotometricReport(
-        gain=float(there.images.gain_offset[0]),
-        agreement=there.images.agreement,
+        gain=float(by_images.gain_offset[0]),
+        agreement=by_images.information.agreement,
     )
     if joint_covariance is None:
         refusal = "the joint information is not definite"
         return pose.replace(photometric=replace(report, refusal=refusal))
-    added = np.linalg.eigvals(covariance @ there.images.information).real
+    added = np.linalg.eigvals(covariance @ information).real
     if added.max() < MIN_ADDED_INFORMATION:
         return pose.replace(photometric=report)
     return pose.replace(
@@ -110,29 +109,23 @@ def _can_be_refined(pair: FramePair, pose: Motion) -> bool:
     return pose.usable and pair.has_images and has_pixels
 
 
-class Joint(NamedTuple):
-    """Images and depth maps at one motion."""
-
-    T_curr_prev: np.ndarray  # (4, 4)
-    images: ImagesAt
-    planes: PlanesAt
-
-    @property
-    def information(self) -> np.ndarray:
-        """(6, 6) of both about the motion."""
-        return self.images.information + self.planes.information
-
-
 def _follow(
-    images: ImageFactor, planes: PlaneFactor, prior: Prior, T: np.ndarray
-) -> Joint:
-    """The motion of least cost, from a start; noise and information are updated."""
-    at = Joint(T, images.first(T), planes.at(T))
+    images: ImageFactor, planes: WeightedPlanes, prior: Prior, T: np.ndarray
+) -> tuple[np.ndarray, ImagesAt, PlanesAt]:
+    """The motion (4, 4) of least cost, from a start, with images and depth maps there.
+
+    Noise and information are updated on the way.
+    """
+    by_images = images.first(T)
+    by_planes = planes.at(T)
     for _ in range(ROUNDS):
-        others = (planes.under(at.planes), prior)
-        T, gain_offset = images.follow(at.images, others, at.T_curr_prev, STEPS)
-        step = se3_log(T @ invert(at.T_curr_prev))
-        at = Joint(T, images.at(T, gain_offset, at.images.noise), planes.at(T))
-        if step @ at.information @ step < MIN_ROUND_STD**2:
+        others = (planes.under(by_planes), prior)
+        ahead, gain_offset = images.follow(by_images, others, T, STEPS)
+        step = se3_log(ahead @ invert(T))
+        T = ahead
+        by_images = images.at(T, gain_offset, by_images.noise)
+        by_planes = planes.at(T)
+        information = by_images.information.matrix + by_planes.information.matrix
+        if step @ information @ step < MIN_ROUND_STD**2:
             break
-    return at
+    return T, by_images, by_planes

@@ -5,8 +5,6 @@ Poses are (3, 4) float64 arrays [R | t], T_curr_prev.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from hybridvo.compiled.numba_tools import njit
@@ -61,23 +59,6 @@ SCALE_PIXELS = 1000
 TOLERANCE_FLOOR_PX = 1e-5
 # Column of the translation in a pose.
 TRANSLATION = 3
-
-
-class Reestimate(NamedTuple):
-    """What is known of a motion after noise and motion were estimated in turn."""
-
-    noise: Noise
-    inlier_ratio: float  # fraction of the weight that follows it
-    iterations: int  # Gauss-Newton steps
-
-
-class RobustFit(NamedTuple):
-    """A motion with its noise."""
-
-    pose: np.ndarray  # (3, 4) T_curr_prev
-    noise: Noise
-    inlier_ratio: float  # fraction of the weight that follows it
-    iterations: int  # Gauss-Newton steps
 
 
 @njit(error_model="numpy", cache=True, nogil=True)
@@ -222,10 +203,13 @@ def anneal(samples, n, K, start_px, end_px, ratio, steps, pose):
 
 @njit(error_model="numpy", cache=True, nogil=True)
 def reestimate(samples, n, K, cutoff, limit, pose):
-    """Estimate noise and motion in turn, the pose in place; return a :class:`Reestimate`.
+    """Estimate noise and motion in turn, the pose in place.
 
     ``cutoff`` is that of the robust kernel, in standard deviations; ``limit`` is about how many
     pixels the noise is estimated from.
+
+    Returns:
+        The noise, the fraction of the weight that follows the motion, and the Gauss-Newton steps.
     """
     cap = Noise(FLOW_NOISE_CAP_PX, DEPTH_NOISE_CAP)
     noise = Noise(START_NOISE.flow_px, START_NOISE.log_depth)
@@ -245,7 +229,7 @@ def reestimate(samples, n, K, cutoff, limit, pose):
         iterations += gauss_newton(
             samples, n, K, weighting, steps, tolerance_px, pose
         )
-    return Reestimate(noise, inlier_ratio, iterations)
+    return noise, inlier_ratio, iterations
 
 
 def translation_scale(samples: np.ndarray, n: int) -> float:
@@ -259,7 +243,7 @@ def translation_scale(samples: np.ndarray, n: int) -> float:
 
 def fit_coarse(
     samples: np.ndarray, n: int, K: np.ndarray, pose: np.ndarray, cutoff: float
-) -> RobustFit:
+) -> tuple[np.ndarray, Noise, float, int]:
     """Fit one motion and its noise to gathered pixels, from a start.
 
     Args:
@@ -268,6 +252,10 @@ def fit_coarse(
         K: (4,) float32 fx, fy, cx, cy of the current camera.
         pose: (3, 4) the start; it stays as it is.
         cutoff: c of the robust kernel, standard deviations.
+
+    Returns:
+        The motion (3, 4), its noise, the fraction of the weight that follows it, and the
+        Gauss-Newton steps.
     """
     pose = np.array(pose, np.float64, order="C")
     scale_px = SCALE_PER_RESIDUAL * residual_scale(samples, n, pose, K)
@@ -282,5 +270,7 @@ def fit_coarse(
         COARSE_STEPS,
         pose,
     )
-    fit = reestimate(samples, n, K, cutoff, FINAL_NOISE_PIXELS, pose)
-    return RobustFit(pose, fit.noise, fit.inlier_ratio, steps + fit.iterations)
+    noise, inlier_ratio, more = reestimate(
+        samples, n, K, cutoff, FINAL_NOISE_PIXELS, pose
+    )
+    return pose, noise, inlier_ratio, steps + more

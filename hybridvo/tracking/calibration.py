@@ -134,10 +134,6 @@ BELIEF_DECAY = 0.95
 with 0.85 as many steps of those clips are wrong."""
 BELIEF_SURE = 0.98
 """Probability of a motion that counts at most for the belief."""
-HANDED_OVER = 0.9
-"""Factor on the log odds of a surface that the next keyframe sees as well."""
-SEEN_THROUGH_LOG_ODDS = -1.5
-"""Log odds of what stands where the keyframe before saw farther."""
 DEPTH_RATIO = (-2.5, 0.7)
 """Least and largest log likelihood ratio by a point's depth."""
 GREY_RATIO = (-2.5, 1.5)

@@ -11,7 +11,7 @@ a Kalman filter of one number does. This also bounds the drift of a long chain o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import RelativePose
 from hybridvo.core.types import Frame
+from hybridvo.core.unchecked import changed
 from hybridvo.solver.calibration import FOLLOWING_WEIGHT, MIN_COMPARED_DEPTHS
 from hybridvo.tracking.calibration import DEPTH_SCALE_DRIFT, DEPTH_SCALE_STD
 
@@ -110,7 +111,7 @@ def divided(frame: Frame, scale: float) -> Frame:
     if frame.depth is None:
         return frame
     depth = frame.depth / np.float32(scale)
-    return replace(frame, depth=depth, depth_scale=frame.depth_scale * scale)
+    return changed(frame, depth=depth, depth_scale=frame.depth_scale * scale)
 
 
 def lengthened(T: np.ndarray, factor: float) -> np.ndarray:

@@ -24,6 +24,7 @@ from hybridvo.core.geometry import (
 )
 from hybridvo.core.results import MotionPrior, RelativePose
 from hybridvo.core.types import Frame
+from hybridvo.core.unchecked import changed
 from hybridvo.tracking.calibration import (
     KEYFRAME_AGE,
     KEYFRAME_CORRELATION,
@@ -96,7 +97,7 @@ def is_near(
 
 def expected_motion(prior: MotionPrior, T_prev_key: np.ndarray) -> MotionPrior:
     """Return what is known of the motion from a keyframe, given that from the previous frame."""
-    return MotionPrior(prior.T_curr_prev @ T_prev_key, prior.covariance)
+    return changed(prior, T_curr_prev=prior.T_curr_prev @ T_prev_key)
 
 
 def between_frames(

@@ -4,7 +4,8 @@ A tracker that judges each pair alone forgets what it found out: which pixels ar
 keeps that as the log odds of every point of a keyframe (:class:`hybridvo.core.belief.Belief`).
 Every frame whose motion is known is evidence: under the camera's motion a static point keeps its
 grey level and its depth. What something nearer hides is no evidence. A later keyframe gets the
-belief through the motion between the two, where both see the same surface.
+belief through the motion between the two, where both see the same surface
+(:mod:`hybridvo.evidence.remembered`).
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from hybridvo.core.geometry import (
 from hybridvo.core.results import RelativePose, Term
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
+from hybridvo.evidence.remembered import Remembered, carried_belief
 from hybridvo.flow.frame_images import blurred, gradient_at
-from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.points import Points, points_of
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
@@ -36,10 +37,8 @@ from hybridvo.tracking.calibration import (
     GREY_RATIO,
     GREY_STD,
     GREY_STD_OF_GRADIENT,
-    HANDED_OVER,
     MAX_CERTAINTY,
     OTHER_STD_OF_GRADIENT,
-    SEEN_THROUGH_LOG_ODDS,
 )
 from hybridvo.tracking.keyframes import Keyframe
 
@@ -74,29 +73,21 @@ def nothing_known(keyframe: Keyframe) -> Memory:
     return Memory(keyframe, Belief(np.zeros(shape, np.float16)))
 
 
-@stage("memory")
-def carried_to(memory: Memory | None, keyframe: Keyframe) -> Memory:
-    """Return what is believed of another keyframe's view.
-
-    A surface that both keyframes see keeps most of its log odds. What was hidden or out of view
-    is unknown. What stands where the earlier keyframe saw farther has come there: it moves.
-    """
-    if memory is None:
-        return nothing_known(keyframe)
+def remembered_at(memory: Memory, keyframe: Keyframe) -> Remembered:
+    """Return what is remembered, for the view of another keyframe."""
     old = memory.keyframe
     if old.count == keyframe.count:
-        return Memory(keyframe, memory.belief)
-    points = points_of(keyframe.frame)
+        return Remembered(memory.belief, old.frame)
     T_old_new = invert(old.T_world_cam) @ keyframe.T_world_cam
-    there = visibility(transform_points(T_old_new, points.xyz), old.frame, 0.0)
-    stands_before = there.distance < -HIDDEN_SIGMAS
-    agrees = there.is_measured & ~there.is_hidden & ~stands_before
-    handed = HANDED_OVER * _at_pixels(memory, there.uv)
-    log_odds = np.where(agrees, handed, 0.0)
-    log_odds[stands_before] = SEEN_THROUGH_LOG_ODDS
-    return Memory(
-        keyframe, Belief(points.on_grid(log_odds), memory.belief.certainty)
-    )
+    return Remembered(memory.belief, old.frame, T_old_new)
+
+
+def carried_to(memory: Memory | None, keyframe: Keyframe) -> Memory:
+    """Return what is believed of another keyframe's view, see :func:`carried_belief`."""
+    if memory is None:
+        return nothing_known(keyframe)
+    known = remembered_at(memory, keyframe)
+    return Memory(keyframe, carried_belief(known, keyframe.frame))
 
 
 def faded(memory: Memory) -> Memory:
@@ -246,16 +237,3 @@ def _certainty_after(
     agrees = float(np.sum(belief.log_odds.astype(np.float32) * ratio)) >= 0
     change = log_odds_of(motion.probability)
     return min(certainty + (change if agrees else -abs(change)), MAX_CERTAINTY)
-
-
-# -- points on a grid ----------------------------------------------------------------
-
-
-def _at_pixels(memory: Memory, uv: np.ndarray) -> np.ndarray:
-    """(N,) log odds of a memory at pixels (N, 2); outside, those of the border."""
-    log_odds = memory.belief.log_odds
-    rows, columns = log_odds.shape
-    height, width = memory.keyframe.frame.camera.shape
-    column = np.clip(uv[:, 0] * columns / width, 0, columns - 1).astype(int)
-    row = np.clip(uv[:, 1] * rows / height, 0, rows - 1).astype(int)
-    return log_odds[row, column].astype(np.float32)

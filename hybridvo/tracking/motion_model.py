@@ -8,6 +8,7 @@ import numpy as np
 
 from hybridvo.core.geometry import invert, pose_matrix, se3_log
 from hybridvo.core.results import MotionPrior, identity_covariance
+from hybridvo.core.unchecked import made
 from hybridvo.tracking.calibration import CHANGE_DECAY, CHANGE_INFLATION
 
 # Changes of the motion; with fewer their standard deviation is not known yet.
@@ -53,11 +54,13 @@ class MotionModel:
         grown = (failures + 1) * sum(k**2 for k in range(1, n + 1))
         T = pose_matrix(np.linalg.matrix_power(self.T_last, n)[:3])
         if self.changes < MIN_CHANGES:
-            return MotionPrior(T, grown * identity_covariance())
+            covariance = grown * identity_covariance()
+            return made(MotionPrior, T_curr_prev=T, covariance=covariance)
         # ten changes are few for the 21 numbers of a covariance: half of it is made isotropic
         mean = self.spread * (1 - CHANGE_DECAY) / (1 - CHANGE_DECAY**self.changes)
         even = np.repeat(
             [np.trace(mean[:3, :3]) / 3, np.trace(mean[3:, 3:]) / 3], 3
         )
         one = CHANGE_INFLATION * 0.5 * (mean + np.diag(even))
-        return MotionPrior(T, grown * (one + MIN_CHANGE_STD**2 * np.eye(6)))
+        covariance = grown * (one + MIN_CHANGE_STD**2 * np.eye(6))
+        return made(MotionPrior, T_curr_prev=T, covariance=covariance)

@@ -7,24 +7,25 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from hybridvo import pipeline
-from hybridvo.core.belief import Belief
 from hybridvo.core.geometry import chain, invert
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, RelativePose, Term
 from hybridvo.core.types import Frame, FramePair
+from hybridvo.core.unchecked import changed
 from hybridvo.evidence.pair import PairEvidence
+from hybridvo.evidence.remembered import Remembered
 from hybridvo.flow.providers import FlowAhead, FlowField, FlowProvider, with_flow
 from hybridvo.solver.rotation_factor import with_rotation
 from hybridvo.tracking.gyroscope import Gyroscope
 from hybridvo.tracking.keyframes import Keyframe, expected_motion, trimmed
-from hybridvo.tracking.memory import carried_to
+from hybridvo.tracking.memory import remembered_at
 from hybridvo.tracking.relocalization import are_apart, similar_places
 from hybridvo.tracking.repeated import Repeat
 from hybridvo.tracking.tracker_state import TrackerState
@@ -95,7 +96,7 @@ class Arrival(NamedTuple):
     @property
     def without_depth(self) -> Arrival:
         """The same by the image of the frame alone."""
-        frame = replace(self.frame, depth=None, depth_variance=None)
+        frame = changed(self.frame, depth=None, depth_variance=None)
         return self._replace(frame=frame)
 
 
@@ -232,15 +233,15 @@ class Pairs:
         if near is not None:
             near = near @ self._T_ref_start(start)
         return context.evidence(
-            pair, expected, remember=self._remember(start), near=near
+            pair, expected, remembered=self._remembered(start), near=near
         )
 
-    def _remember(self, start: Keyframe) -> Callable[[], Belief] | None:
-        """Returns what is believed of the view of a start, when it is called; None: nothing."""
+    def _remembered(self, start: Keyframe) -> Remembered | None:
+        """What is remembered, for the view of a start; None: nothing."""
         memory = self.state.memory
         if memory is None or not start.frame.is_rgbd or not self.setup.remembers:
             return None
-        return lambda: carried_to(memory, start).belief
+        return remembered_at(memory, start)
 
     @contextlib.contextmanager
     def flow_ahead(self) -> Iterator[FlowProvider | None]:

@@ -21,6 +21,7 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
+from hybridvo.core.unchecked import changed
 from hybridvo.evidence.pair import FlowEvidence
 from hybridvo.flow.providers import (
     FlowField,
@@ -172,7 +173,7 @@ class Tracker:
             gyroscope = (gyroscope or Gyroscope()).after(imu)
         frame = deepcopy(frame)
         if frame.index is None:
-            frame = replace(frame, index=before.count)
+            frame = changed(frame, index=before.count)
         repeat = repeat_of(sensors.last, frame)
         clock = sensors.clock.after(frame.timestamp)
         breaks = sensors.clock.breaks_at(frame.timestamp) and not repeat.entire

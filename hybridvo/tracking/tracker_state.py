@@ -10,6 +10,7 @@ from hybridvo.core.geometry import invert
 from hybridvo.core.gravity import Gravity
 from hybridvo.core.results import MotionPrior, Term
 from hybridvo.core.types import Frame
+from hybridvo.core.unchecked import changed
 from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.depth_scale import (
     ScaleFilter,
@@ -125,7 +126,7 @@ class TrackerState:
         if one is None or all_since is None:
             return None
         T = one.T_curr_prev @ self.T_last_reference
-        return MotionPrior(T, all_since.covariance)
+        return changed(all_since, T_curr_prev=T)
 
     @property
     def T_last_reference(self) -> np.ndarray:

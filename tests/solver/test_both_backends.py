@@ -48,7 +48,7 @@ def external_weights(pair: FramePair) -> np.ndarray:
 def full_cost(pair: FramePair, T: np.ndarray) -> float:
     grid = PixelGrid(pair, external_weights(pair))
     weighting = kernels.residual_noise(*NOISE, 3.0)
-    return grid.full_pass(T[:3], weighting, 16).cost
+    return float(grid.full_pass(T[:3], weighting, 16).totals[:, kernels.COST].sum())
 
 
 def torch_cost(pair: FramePair, T: np.ndarray) -> float:

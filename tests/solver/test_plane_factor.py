@@ -11,7 +11,8 @@ import hybridvo as hvo
 from hybridvo.core.geometry import se3_exp
 from hybridvo.core.options import RefineOptions
 from hybridvo.solver.newton import MotionState
-from hybridvo.solver.planes import PlaneFactor, PlanesAt, depth_quantum
+from hybridvo.solver.plane_kernels import PlanesAt
+from hybridvo.solver.planes import WeightedPlanes, depth_quantum, planes_of
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
 from tests import worlds
@@ -19,8 +20,10 @@ from tests import worlds
 SIZE = (192, 256)
 
 
-def factor_of(pair) -> PlaneFactor:
-    return PlaneFactor(pair, np.ones(SIZE, np.float32), 0.25, RefineOptions())
+def factor_of(pair) -> WeightedPlanes:
+    return planes_of(pair).weighted(
+        np.ones(SIZE, np.float32), 0.25, RefineOptions()
+    )
 
 
 def gradient(at: PlanesAt) -> np.ndarray:
@@ -29,7 +32,7 @@ def gradient(at: PlanesAt) -> np.ndarray:
     return -sums[PlaneRow.MOTION :, PlaneRow.RESIDUAL]
 
 
-def cost(factor: PlaneFactor, at: PlanesAt, T: np.ndarray) -> float:
+def cost(factor: WeightedPlanes, at: PlanesAt, T: np.ndarray) -> float:
     """The cost at a motion, under the noise at another one."""
     noisy = factor.under(at)._replace(information_scale=1.0)
     return noisy.linearize(MotionState(T)).cost
@@ -55,8 +58,8 @@ def test_exact_depth_alone_gives_the_motion():
     for _ in range(20):
         at = factor.at(start)
         assert at.determine_motion
-        scaled = at.information_scale * gradient(at)
-        step = np.linalg.solve(at.information, scaled)
+        scaled = at.information.scale * gradient(at)
+        step = np.linalg.solve(at.information.matrix, scaled)
         start = se3_exp(step) @ start
     worlds.assert_pose_close(start, T, rad=2e-4, m=1e-3)
 
@@ -94,7 +97,7 @@ def test_the_noise_follows_the_sensor(polynomial, least, most):
 def test_nothing_is_made_of_maps_without_depth():
     pair, T = worlds.world(SIZE)
     nothing = np.zeros(SIZE, np.float32)
-    without = PlaneFactor(pair, nothing, 0.25, RefineOptions())
+    without = planes_of(pair).weighted(nothing, 0.25, RefineOptions())
     assert not without.at(T).determine_motion
     empty = replace(pair, curr=replace(pair.curr, depth=np.zeros(SIZE, np.float32)))
     assert not factor_of(empty).at(T).determine_motion
@@ -129,12 +132,8 @@ def test_two_equally_rounded_maps_are_not_taken_for_exact():
     depth = rounded(2.0 + 0.3 * waves, 0.00285)
     camera = hvo.Camera(160, 160, 79.5, 59.5, 120, 160)
     frame = hvo.Frame(None, depth, camera)
-    planes = PlaneFactor(
-        hvo.FramePair(frame, frame, None),
-        np.ones((120, 160)),
-        0.5,
-        RefineOptions(),
-    )
+    pair = hvo.FramePair(frame, frame, None)
+    planes = planes_of(pair).weighted(np.ones((120, 160)), 0.5, RefineOptions())
     at = planes.at(np.eye(4))
     assert at.determine_motion
     step_m = 0.00285 * 2.0**2

@@ -104,7 +104,10 @@ def test_a_pull_is_what_an_error_does_to_the_score(kind):
     factor = np.exp(-part * log_depth) if kind == "depth" else 1.0
     wrong, _ = still_grid(error.astype(np.float32), np.float32(factor))
     found = wrong.full_pass(pose, noise, tile)
-    scores = found.tiles[..., kernels.HESSIAN_SUMS :] / found.external_sum
+    scores = (
+        found.tiles[..., kernels.HESSIAN_SUMS :]
+        / found.totals[:, kernels.EXTERNAL_SUM].sum()
+    )
     scale = np.abs(pulls).max(axis=(0, 1))
     # the robust weights fall by 2 d^2 / c^2: 0.2 %; single precision
     np.testing.assert_allclose(scores / part / scale, pulls / scale, atol=0.02)

@@ -18,17 +18,16 @@ from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.core.results import RelativePose, Status
 from hybridvo.core.types import FramePair
-from hybridvo.hypotheses.direct import align_images
+from hybridvo.evidence.calibration import HANDED_OVER, SEEN_THROUGH_LOG_ODDS
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.probability import probability_of
 from hybridvo.pipeline import sure_alignment
 from hybridvo.run.commands.run import restored, saved
+from hybridvo.solver.align import align_images
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,
     BELIEF_LIMIT,
-    HANDED_OVER,
-    SEEN_THROUGH_LOG_ODDS,
 )
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import (

@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Motion, PhotometricReport
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.hypotheses.direct import align_images
-from hybridvo.hypotheses.direct_evidence import (
+from hybridvo.judge.calibration import DIRECT_PROBABILITY
+from hybridvo.judge.probability import direct_probability
+from hybridvo.pipeline import sure_alignment
+from hybridvo.solver.align import align_images
+from hybridvo.solver.aligned_points import (
     SeenPoints,
     direct_evidence,
     see_points,
     weighted_median,
 )
-from hybridvo.judge.calibration import DIRECT_PROBABILITY
-from hybridvo.judge.probability import direct_probability
-from hybridvo.pipeline import sure_alignment
-from hybridvo.solver.planes import PlaneFactor
+from hybridvo.solver.planes import planes_of
 from hybridvo_lab.synthetic.slow_scenes import (
     noisy_image,
     slow_scene,
@@ -54,7 +54,7 @@ def seen(left_px: float, right_px: float) -> SeenPoints:
     grey[:, SIZE[1] // 2 :] = waves(right_px)[:, SIZE[1] // 2 :]
     pair = FramePair(frame(waves(0.0), 0), frame(grey, 1), None)
     ones = np.ones(SIZE, np.float32)
-    planes = PlaneFactor(pair, ones, 0.0, RefineOptions())
+    planes = planes_of(pair).weighted(ones, 0.0, RefineOptions())
     at = planes.at(np.eye(4))
     return see_points(pair, planes, at, NO_MOTION, CUTOFF)
 
@@ -82,7 +82,8 @@ def test_a_view_without_texture_shows_no_shift() -> None:
     pair = FramePair(
         frame(np.full(SIZE, 90.0), 0), frame(np.full(SIZE, 90.0), 1), None
     )
-    planes = PlaneFactor(pair, np.ones(SIZE, np.float32), 0.0, RefineOptions())
+    ones = np.ones(SIZE, np.float32)
+    planes = planes_of(pair).weighted(ones, 0.0, RefineOptions())
     at = planes.at(np.eye(4))
     points = see_points(pair, planes, at, NO_MOTION, CUTOFF)
     outside = points._replace(inside=np.zeros_like(points.inside))

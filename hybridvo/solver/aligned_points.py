@@ -28,7 +28,8 @@ from hybridvo.solver.calibration import (
     SHOWN_SHIFT,
 )
 from hybridvo.solver.correlated_errors import MAD_TO_STD
-from hybridvo.solver.planes import PlaneFactor, PlanesAt
+from hybridvo.solver.plane_kernels import PlanesAt
+from hybridvo.solver.planes import WeightedPlanes
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PlaneRow
 
@@ -106,7 +107,7 @@ def direct_evidence(
 class SeenPoints(NamedTuple):
     """What the two images show of the points (N,) of the depth maps, moved along a motion."""
 
-    planes: PlaneFactor
+    planes: WeightedPlanes
     follows: np.ndarray  # bool: whether grey value and depth are as they would be
     inside: np.ndarray  # bool: visible inside the current image
     flow_px: np.ndarray  # how far the motion moves them in the image
@@ -205,7 +206,7 @@ class SeenPoints(NamedTuple):
 
 def see_points(
     pair: FramePair,
-    planes: PlaneFactor,
+    planes: WeightedPlanes,
     at: PlanesAt,
     motion: Motion,
     cutoff: float,
@@ -268,7 +269,7 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values[order[middle]])
 
 
-def _summed(planes: PlaneFactor, values: np.ndarray) -> np.ndarray:
+def _summed(planes: WeightedPlanes, values: np.ndarray) -> np.ndarray:
     """(N,) sums of values (N,) of the points over the region around each."""
     return REGION_SIDE**2 * _around(planes, values, REGION_SIDE)
 
@@ -283,7 +284,7 @@ def ego_flow_std(pair: FramePair, points: np.ndarray, motion: Motion) -> float:
     return float(np.sqrt(squared))
 
 
-def _around(planes: PlaneFactor, values: np.ndarray, side: int) -> np.ndarray:
+def _around(planes: WeightedPlanes, values: np.ndarray, side: int) -> np.ndarray:
     """(N,) averages of values (N,) of the points over a square around each."""
     averaged = cv2.blur(planes.on_grid(values), (side, side))
     return np.asarray(averaged[planes.cells])

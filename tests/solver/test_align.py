@@ -15,10 +15,10 @@ from hybridvo.core.results import Reason, RelativePose
 from hybridvo.core.types import FramePair
 from hybridvo.flow.frame_images import reduced
 from hybridvo.flow.providers import FlowField, dis_flow, with_flow
-from hybridvo.hypotheses.direct import align_images
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.verdict import believed
 from hybridvo.pipeline import Context, run_method, sure_alignment
+from hybridvo.solver.align import align_images
 from tests.solver.test_photometric import error_px, made_pair
 
 SIZE = {"height": 240, "width": 320}

@@ -17,7 +17,7 @@ from hybridvo.core.options import RefineOptions
 from hybridvo.core.results import Motion, PhotometricReport, Term
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import have_texture
-from hybridvo.hypotheses.direct_evidence import (
+from hybridvo.solver.aligned_points import (
     TINY,
     RememberedEvidence,
     SeenPoints,
@@ -32,7 +32,8 @@ from hybridvo.solver.calibration import (
 )
 from hybridvo.solver.coarse_images import follow_images
 from hybridvo.solver.covariance import covariance_of_sources
-from hybridvo.solver.planes import PlaneFactor, PlanesAt
+from hybridvo.solver.plane_kernels import PlanesAt
+from hybridvo.solver.planes import WeightedPlanes, planes_of
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.visibility import visibility
 
@@ -135,7 +136,7 @@ def align_images(
         return None
     ones = np.ones(pair.prev.camera.shape, np.float32)
     weights = ones if belief is None else resized(belief.weights, ones.shape)
-    few_planes = PlaneFactor(pair, weights, 0.0, options, REDUCED_POINTS)
+    few_planes = planes_of(pair, REDUCED_POINTS).weighted(weights, 0.0, options)
     if len(few_planes.index) < MIN_PLANE_POINTS:
         return None
     T = np.eye(4) if T_start is None else T_start
@@ -145,14 +146,14 @@ def align_images(
         covariance=np.zeros((6, 6)),
         photometric=PhotometricReport(gain=gain),
     )
-    planes = PlaneFactor(pair, ones, 1.0, options)
+    planes = planes_of(pair).weighted(ones, 1.0, options)
     return _aligned(pair, motion, planes, options, belief, is_exact=True)
 
 
 def _aligned(
     pair: FramePair,
     motion: Motion,
-    planes: PlaneFactor,
+    planes: WeightedPlanes,
     options: RefineOptions,
     belief: Belief | None,
     is_exact: bool = False,
