@@ -37,8 +37,8 @@ from hybridvo.core.results import RelativePose, Step
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo.io.data.open import open_sequence
 from hybridvo.io.data.resize import resize_camera
-from hybridvo.network.inputs import assemble_inputs
 from hybridvo.solver import robust_fit
+from hybridvo_lab.paper.inputs import assemble_inputs
 from tests.walks import chained
 
 RIGHT_TURN_ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

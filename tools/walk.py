@@ -5,10 +5,11 @@
 
 A room is a folder of the package, or a file beside the folders. ``returns`` counts how often the
 walk comes back to a room, or a file, that it had left, each function taken where it is called
-first: merging files cannot lower the returns between rooms. ``types`` are the record types
-(named tuples and dataclasses) that are made for the frame, ``records`` how many. The frames: one
-in which nothing moves, one with movers that images and memory answer, one with movers that needs
-flow and the network. Kernels that numba compiles are not seen.
+first: merging files cannot lower the returns between rooms. ``without core``: the same between
+the rooms that do something, and do not only say what a pose or a status is. ``types`` are the
+record types (named tuples and dataclasses) that are made for the frame, ``records`` how many. The
+frames: one in which nothing moves, one with movers that images and memory answer, one with movers
+that needs flow and the network. Kernels that numba compiles are not seen.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ PACKAGE = Path(hybridvo.__file__).parent
 FAMILIES = ("static", "heavy_two", "heavy_rigid")
 """Of rendered scenes."""
 FRAMES = 5
+VOCABULARY = ("core", "compiled")
+"""Rooms of what every other one is written in: a walk may be counted without them."""
 
 
 class Found(NamedTuple):
@@ -121,8 +124,10 @@ def line(kind: str, walk: list[str], calls: int, made: Counter[str]) -> str:
     """What is counted of a walk."""
     files = [place.split(":")[0] for place in walk]
     rooms = [file.split("/")[0] for file in files]
+    others = [room for room in rooms if room not in VOCABULARY]
     return (
-        f"{kind:14s} rooms {len(set(rooms)):2d}, returns {returns(rooms):3d} | "
+        f"{kind:14s} rooms {len(set(rooms)):2d}, returns {returns(rooms):3d}, "
+        f"{returns(others):2d} without core | "
         f"files {len(set(files)):2d}, returns {returns(files):3d} | "
         f"functions {len(walk)}, calls {calls} | "
         f"types {len(made)}, records {sum(made.values())}"

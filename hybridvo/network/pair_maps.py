@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -89,7 +90,9 @@ def predict_pairs(
     looks = []
     parts = []
     for pair, prior, more in zip(pairs, priors, starts, strict=True):
-        look = look_at_pair(network, pair, prior, options, seed, more)
+        look = None
+        with contextlib.suppress(StageFailed):
+            look = look_at_pair(network, pair, prior, options, seed, more)
         prediction = _no_motion(network) if look is None else look.prediction
         looks.append(look)
         parts.append(_on_grid(prediction, shape))
@@ -112,20 +115,20 @@ def look_at_pair(
     options: Options | None = None,
     seed: int = 0,
     starts: Sequence[np.ndarray] = (),
-) -> PairLook | None:
-    """Look at every hypothesis of a pair, and return the surest; None where there is none.
+) -> PairLook:
+    """Look at every hypothesis of a pair, and return the surest.
 
     Motions (4, 4) to start from are tried beside the identity and the prior.
+
+    Raises:
+        StageFailed: if flow, depth or usable pixels are missing, or determine no motion.
     """
     options = Options() if options is None else options
     tried = [np.eye(4)]
     if prior is not None:
         tried.append(prior.T_curr_prev)
     tried.extend(starts)
-    try:
-        found = generate(pair, np.stack(tried), options, seed)
-    except StageFailed:
-        return None
+    found = generate(pair, np.stack(tried), options, seed)
     scorer = PWVOScorer(network, found, prior)
     ranking = rank_by_scorer(found, scorer, options)
     best = ranking.candidates[ranking.best]

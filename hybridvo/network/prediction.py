@@ -13,21 +13,16 @@ from hybridvo.core.results import (
     MotionPrior,
     PixelwisePrediction,
     Reason,
-    StageFailed,
     Status,
     Term,
 )
 from hybridvo.core.types import FramePair
 from hybridvo.hypotheses.select import ChoiceEvidence
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
-from hybridvo.network.pair_maps import predict_pairs
+from hybridvo.network.pair_maps import look_at_pair
 from hybridvo.network.selection import select_pose
 from hybridvo.network.threads import single_threaded_inference
-from hybridvo.solver.pixels import too_few
 
-# pixels of the input with flow and depth that a network needs
-MIN_NETWORK_PIXELS = 64
 # degrees of uncertainty above which an answer is degraded: more than most cameras
 # turn between two frames
 MAX_NETWORK_SCALE_DEG = 2.0
@@ -61,31 +56,11 @@ def estimate_by_pwvo(
     Raises:
         StageFailed: if flow, depth or usable pixels are missing.
     """
-    usable_inputs(pair)
     with single_threaded_inference():
-        maps = predict_pairs(network, [pair], [prior], options, seed)
-    found = selected_motion(maps, "softmax")
+        maps = look_at_pair(network, pair, prior, options, seed).prediction
     assert maps.evidence is not None
-    evidence = maps.evidence[0].tolist()
-    if np.isnan(evidence).any():
-        raise StageFailed(
-            Reason.DEGENERATE_GEOMETRY, "the pixels do not determine any motion"
-        )
-    return found.replace(evidence=ChoiceEvidence(*evidence))
-
-
-def usable_inputs(pair: FramePair) -> NetworkInputs:
-    """The inputs of the paper's networks; fails where a pair has too little of them."""
-    if pair.flow is None:
-        raise StageFailed(Reason.NO_FLOW, "no optical flow for this pair")
-    depth = pair.prev.depth
-    if depth is None:
-        raise StageFailed(Reason.NO_VALID_DEPTH, "no depth for this frame")
-    inputs = assemble_inputs(pair)
-    count = int(inputs.valid.sum())
-    if count < MIN_NETWORK_PIXELS:
-        raise StageFailed(*too_few(depth, pair.flow, count, MIN_NETWORK_PIXELS))
-    return inputs
+    evidence = ChoiceEvidence(*maps.evidence[0].tolist())
+    return selected_motion(maps, "softmax").replace(evidence=evidence)
 
 
 def selected_motion(maps: PixelwisePrediction, selection: str) -> Motion:

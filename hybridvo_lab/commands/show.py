@@ -12,7 +12,7 @@ from hybridvo.core.errors import InputError
 from hybridvo.core.files import make_folder
 from hybridvo.core.geometry import matrix_to_euler_deg
 from hybridvo.core.options import NETWORK
-from hybridvo.core.results import PixelwisePrediction
+from hybridvo.core.results import PixelwisePrediction, StageFailed
 from hybridvo.core.types import FramePair
 from hybridvo.flow.providers import FlowProvider, dis_flow
 from hybridvo.io.data.open import iter_pairs
@@ -126,8 +126,9 @@ def _network_panels(
 ) -> list[Panel]:
     """Make the panels of what PWVO predicts for a pair, and of what it looks at."""
     network = models.network("pwvo")
-    look = look_at_pair(network, given)
-    if look is None:
+    try:
+        look = look_at_pair(network, given)
+    except StageFailed:
         return []
     truth = None
     if T_gt is not None:

@@ -15,8 +15,8 @@ from torch import nn
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import option_group
-from hybridvo.network.inputs import NetworkInputs
 from hybridvo.network.pwvo import scaled
+from hybridvo_lab.paper.inputs import NetworkInputs
 
 INPUT_LIMIT = 100.0
 """Limit of the inputs, so that activations cannot overflow: 20 000 px of flow, 1 cm."""

@@ -18,7 +18,7 @@ from pydantic import Field
 from hybridvo.core.options import Positive, option_group
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.torch_geometry import pixel_grid, reproject
-from hybridvo.network.inputs import MIN_DEPTH, TensorBatch
+from hybridvo_lab.paper.inputs import MIN_DEPTH, TensorBatch
 from hybridvo_lab.training import ranks
 
 Scales = torch.Tensor | None

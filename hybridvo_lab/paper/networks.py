@@ -18,11 +18,11 @@ from torch import nn
 from hybridvo.core.checks import check_kind
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import FramePair, PairBatch
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.pwvo import scaled
 from hybridvo.network.selection import INVALID_LOG_SCALE
 from hybridvo.network.weights import read_network_of
 from hybridvo_lab.paper import layers
+from hybridvo_lab.paper.inputs import NetworkInputs, assemble_inputs
 from hybridvo_lab.paper.layers import (
     InputBranches,
     NetworkOptions,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 
 from hybridvo.network.hypothesis_inputs import quantiles
-from hybridvo.network.inputs import NetworkInputs, pinhole
+from hybridvo_lab.paper.inputs import NetworkInputs, pinhole
 from hybridvo_lab.paper.layers import NetworkOptions
 
 # The networks were trained with the numbers of this file: a change of one of them needs
@@ -66,7 +66,7 @@ def normalize(
     angle, and m times the near depth.
 
     Args:
-        inputs: what :func:`hybridvo.network.inputs.assemble_inputs` returns.
+        inputs: what :func:`hybridvo_lab.paper.inputs.assemble_inputs` returns.
         options: of the network.
 
     Returns:

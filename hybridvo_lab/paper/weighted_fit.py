@@ -12,9 +12,9 @@ import torch
 from hybridvo.core.errors import InputError
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.torch_geometry import se3
-from hybridvo.network.inputs import NetworkInputs, pinhole
 from hybridvo.network.selection import rotation_log_scale, select_motion
 from hybridvo.solver.torch.factors import Pixels, fit_pixels
+from hybridvo_lab.paper.inputs import NetworkInputs, pinhole
 
 # weights are exp(-4 s), s the log scale of the uncertainty: errors on one moving
 # object are alike, and one on two thirds of the image must not outweigh the rest

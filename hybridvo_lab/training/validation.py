@@ -17,13 +17,13 @@ from hybridvo.core.errors import InputError
 from hybridvo.core.euler import euler_motion, euler_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import PairBatch
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.selection import select_pose
 from hybridvo_lab.calibration import (
     MAX_RIGHT_PX,
     RIGHT_FACTOR,
     WRONG_PX,
 )
+from hybridvo_lab.paper.inputs import NetworkInputs, assemble_inputs
 from hybridvo_lab.paper.losses import LossTargets
 from hybridvo_lab.synthetic.dataset import Preset
 from hybridvo_lab.synthetic.draws import sample_generator

@@ -12,7 +12,7 @@ from hybridvo.core.euler import euler_motion
 from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import Camera, PairBatch
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
+from hybridvo_lab.paper.inputs import NetworkInputs, assemble_inputs
 from hybridvo_lab.paper.losses import LossOptions, LossTargets, total_loss
 from hybridvo_lab.paper.networks import NetworkOptions, build_network
 from hybridvo_lab.paper.normalization import normalize

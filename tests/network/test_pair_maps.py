@@ -72,7 +72,7 @@ def test_the_maps_are_those_of_the_surest_hypothesis(network, pairs) -> None:
         look = look_at_pair(network, pairs[0])
         maps = network(pairs[0])
         again = network.maps(network.look(look.inputs))
-    assert look is not None and len(look.inputs.owner) == 1
+    assert len(look.inputs.owner) == 1
     torch.testing.assert_close(look.prediction.motion, maps.motion)
     torch.testing.assert_close(look.prediction.evidence, maps.evidence)
     # the hypothesis alone has no rivals: its maps are near, not the same
@@ -128,7 +128,7 @@ def test_a_prior_is_looked_at(network, known) -> None:
         plain = predict_pairs(network, [pair, pair])
         both = predict_pairs(network, [pair, pair], [None, prior])
         look = look_at_pair(network, pair, prior)
-    assert look is not None and look.inputs.has_prior.all()
+    assert look.inputs.has_prior.all()
     expected = torch.as_tensor(truth["T_curr_prev"][:3], dtype=torch.float32)
     torch.testing.assert_close(look.inputs.T_prior[0], expected)
     torch.testing.assert_close(plain.motion[0], plain.motion[1])

@@ -9,8 +9,8 @@ import torch
 
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import PairBatch
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
 from hybridvo.network.selection import INVALID_LOG_SCALE
+from hybridvo_lab.paper.inputs import NetworkInputs, assemble_inputs
 from hybridvo_lab.paper.layers import SelfAttention
 from hybridvo_lab.paper.networks import NetworkOptions, build_network
 

@@ -12,10 +12,10 @@ from hybridvo.core.options import Options
 from hybridvo.core.results import PixelwisePrediction, Reason, StageFailed, State
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.judge.verdict import believed
-from hybridvo.network.inputs import assemble_inputs
 from hybridvo.network.prediction import estimate_by_pwvo
 from hybridvo.network.pwvo import PWVO, PWVOOptions
 from hybridvo.network.selection import select_motion
+from hybridvo_lab.paper.inputs import assemble_inputs
 from hybridvo_lab.paper.networks import NetworkOptions, build_network
 from hybridvo_lab.paper.prediction import estimate_by_network
 from hybridvo_lab.paper.weighted_fit import fitted_motion

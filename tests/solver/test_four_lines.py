@@ -206,7 +206,7 @@ def test_kornia_and_pypose_carry_the_method(pairs, calls) -> None:
 
 def test_one_training_step_of_a_narrow_network_in_channels_last() -> None:
     """At the paper's size, where oneDNN wrote past its memory under strided 1x1 convolutions."""
-    from hybridvo.network.inputs import assemble_inputs
+    from hybridvo_lab.paper.inputs import assemble_inputs
     from hybridvo_lab.paper.networks import NetworkOptions, build_network
 
     torch.manual_seed(0)

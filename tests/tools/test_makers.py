@@ -61,5 +61,4 @@ def seeds_of_a_pair() -> dict:
     T = np.asarray(truth["T_curr_prev"], float)
     known = KnownPair(pair, T, truth["depth_true"], truth["moving"])
     look = look_at_pair(PWVO.from_pretrained(), pair)
-    assert look is not None
     return sentence.errors_of(known, sentence.static_part(known), look)

@@ -11,6 +11,7 @@ no second flow is tried. The pairs are those of the heavy scenes and of clips by
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +34,7 @@ from scipy.stats import spearmanr
 from bench.semi_real import StaticPart, static_part
 from hybridvo import PWVO, PairBatch, refine
 from hybridvo.core.geometry import pose_matrix
+from hybridvo.core.results import StageFailed
 from hybridvo.network.pair_maps import PairLook, look_at_pair
 from hybridvo.network.selection import seed_weights
 from hybridvo.solver.torch.patches import PatchPoses, patch_poses
@@ -180,8 +182,8 @@ def rows_of(source: Source) -> list[dict[str, Any]]:
     for known in source.pairs():
         if known.pair.flow is None:
             continue
-        look = look_at_pair(network, known.pair)
-        if look is not None:
+        with contextlib.suppress(StageFailed):
+            look = look_at_pair(network, known.pair)
             rows.append(errors_of(known, static_part(known), look))
     return rows
 

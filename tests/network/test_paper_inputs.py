@@ -9,7 +9,7 @@ import torch
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
-from hybridvo.network.inputs import NetworkInputs, assemble_inputs
+from hybridvo_lab.paper.inputs import NetworkInputs, assemble_inputs
 
 CAMERA = Camera(20.0, 25.0, 3.5, 1.5, 4, 8)
 
