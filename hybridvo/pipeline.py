@@ -346,8 +346,8 @@ class Method:
             None where there is none yet.
         networks: names of the weights that it uses.
         on_images: whether its answer is fitted to the two images at the end.
-        is_verified: whether its answers are held against images and depth maps: those of other
-            libraries and of the paper's rows are shown as they are.
+        is_verified: whether its answers, where they have weights, are held against images and
+            depth maps: those of other libraries and of the paper's rows are shown as they are.
         cheap_rounds: sources whose cost is known beforehand: of ``hybrid`` the images alone, and
             one flow of theirs or depth alone. Further flow, from sparse matches, may take a second.
         missing: returns why it cannot run here, and the remedy; empty where it can.

@@ -235,14 +235,16 @@ class Term(enum.StrEnum):
     """What a motion is based on."""
 
     FLOW = "flow"
+    """A field of flow: a method ``on_images`` then refines it on the two images."""
     IMAGES = "images"
-    # of the current frame
+    """The two images, densely or by matches: without flow they are not asked whether they agree."""
     DEPTH = "depth"
+    """Depth of the current frame; alone, no image has confirmed the motion."""
     GYROSCOPE = "gyroscope"
-    # only what is believed to be static confirms it
     MEMORY = "memory"
-    # what was expected decides a direction that depth leaves open
+    """Only what is believed to be static confirms it."""
     EXPECTED = "expected"
+    """What was expected decides a direction that depth leaves open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +252,9 @@ class Motion:
     """A camera motion that a source found in a pair, and what speaks for it.
 
     The judge makes a :class:`RelativePose` of it, which has the same attributes, and states how
-    probable it is; the status is here that of the source alone.
+    probable it is; the status is here that of the source alone. Whoever makes one fills motion,
+    covariance, ``terms``, ``weights`` (without them it is not held against images and depth maps)
+    and ``evidence`` (without any its probability is 1).
     """
 
     T_curr_prev: np.ndarray = field(default_factory=lambda: np.eye(4))

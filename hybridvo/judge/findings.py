@@ -17,9 +17,10 @@ class Finding(NamedTuple):
     """What a witness states of a motion.
 
     Attributes:
-        covariance: (6, 6) that is added to the motion's.
+        covariance: (6, 6) that is added to the motion's; to widen that by a factor k,
+            ``(k - 1) * motion.covariance``.
         probability: the motion is right with at most this.
-        status: of the motion; None: nothing is stated of it.
+        status: of the motion, in the place of what was stated so far; None: it stays.
     """
 
     covariance: np.ndarray

@@ -34,10 +34,20 @@ def probability_of(evidence: tuple[float, ...]) -> float:
 
     Args:
         evidence: what its source says for it; its type says what that is.
+
+    Raises:
+        TypeError: for a kind of evidence of which no probability is known.
     """
     if not evidence:
         return 1.0
-    return float(np.nan_to_num(_PROBABILITIES[type(evidence)](evidence)))
+    kind = type(evidence)
+    if kind not in PROBABILITIES:
+        known = ", ".join(each.__name__ for each in PROBABILITIES)
+        raise TypeError(
+            f"evidence: expected one of {known}, got {kind.__name__}; add a row to PROBABILITIES "
+            "in hybridvo/judge/probability.py."
+        )
+    return float(np.nan_to_num(PROBABILITIES[kind](evidence)))
 
 
 def logistic(evidence: Sequence[float], weights: Sequence[float]) -> float:
@@ -105,13 +115,14 @@ def depth_probability(evidence: DepthEvidence) -> float:
     return WITHOUT_IMAGES_RIGHT * evidence.in_view * evidence.inlier_ratio
 
 
-_PROBABILITIES: dict[type, Callable[[Any], float]] = {
+PROBABILITIES: dict[type, Callable[[Any], float]] = {
     ChoiceEvidence: choice_probability,
     CueEvidence: cue_probability,
     DirectEvidence: direct_probability,
     RememberedEvidence: remembered_probability,
     DepthEvidence: depth_probability,
 }
+"""The probability of each kind of evidence, to which another package may add its own."""
 
 
 def surest_evidence(aligned: Aligned) -> Motion:

@@ -35,6 +35,8 @@ def judge(
 ) -> RelativePose:
     """Return a motion with the covariance, probability and status that all findings leave it.
 
+    Where it is not ok, the pipeline asks the next source, which may cost flow.
+
     Args:
         evidence: what can be measured of the pair.
         motion: of the pair.

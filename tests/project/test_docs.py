@@ -112,7 +112,8 @@ def test_every_reason_that_is_explained_can_occur():
     reasons = [reason for reason in hybridvo.Reason if reason.value]
     assert [r.name for r in reasons if f"Reason.{r.name}" not in produced] == []
     outputs = (ROOT / "docs/outputs.md").read_text(encoding="utf-8")
-    assert [r.value for r in reasons if f"| `{r.value}` |" not in outputs] == []
+    missing = [r.value for r in reasons if f"| `{r.value}` |" not in outputs]
+    assert missing == [], "add a row to docs/outputs.md, Status and reason"
 
 
 def test_public_names_that_are_written_exist():
