@@ -182,7 +182,7 @@ def read_poses(path: Path, *columns: str) -> tuple[Rows, np.ndarray]:
     if rows.numbers.shape[1] == column_count("kitti"):
         T[:, :3] = _matrices(rows, finite)
     elif finite.any():
-        T[finite] = _from_quaternions(rows, finite)
+        T[finite] = poses_of_quaternions(rows, finite)
     T[~finite] = np.nan
     return rows, T
 
@@ -200,8 +200,16 @@ def _matrices(rows: Rows, finite: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _from_quaternions(rows: Rows, finite: np.ndarray) -> np.ndarray:
-    """(n, 4, 4) poses of the finite rows, which end in tx ty tz qx qy qz qw."""
+def poses_of_quaternions(rows: Rows, finite: np.ndarray) -> np.ndarray:
+    """Return the poses (n, 4, 4) of the finite rows, which end in tx ty tz qx qy qz qw.
+
+    Args:
+        rows: of a list.
+        finite: (N,) bool, which of them are finite.
+
+    Raises:
+        FormatError: names the line of a quaternion whose length is not 1.
+    """
     xyzw = rows.numbers[:, -4:]
     # far from a unit quaternion is as wrong as very far: squares must not overflow
     length = np.linalg.norm(xyzw.clip(-2, 2), axis=1)

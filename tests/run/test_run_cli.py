@@ -12,7 +12,9 @@ import pytest
 
 from hybridvo import __version__
 from hybridvo.io.data.datasets import SINTEL_PARTS
+from hybridvo.io.data.open import READERS
 from hybridvo.run.cli import main
+from hybridvo.run.commands.arguments import KINDS
 from hybridvo.run.commands.dispatch import SCENE_FOLDERS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,6 +103,11 @@ def test_methods_that_are_known_early_are_all():
 
     assert early.METHODS == tuple(pipeline.METHODS)
     assert set(early.EARLIER_METHODS) == set(pipeline.EARLIER_NAMES)
+
+
+def test_the_help_names_every_kind_of_recording():
+    named = KINDS.replace(" or ", ", ").split(", ")
+    assert sorted(named) == sorted(READERS), "add it to KINDS in arguments.py"
 
 
 def test_a_scene_of_sintel_may_be_named_by_any_of_its_parts(dataset, tmp_path):

@@ -97,7 +97,7 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     return files
 
 
-def listed_file(folder: Path, name: str, listed_in: Path) -> Path:
+def listed_file(folder: Path, name: str, listed_in: object) -> Path:
     """Return the path of a file that a list names, if it lies below the sequence's folder.
 
     Links are followed first. The folder itself and the folders in it may be links to elsewhere, as
@@ -106,7 +106,7 @@ def listed_file(folder: Path, name: str, listed_in: Path) -> Path:
     Args:
         folder: The folder of the sequence.
         name: The name of the file in the list, relative to the folder.
-        listed_in: The list, for messages.
+        listed_in: The list, for messages: its path, or ``path:line``.
 
     Raises:
         FormatError: The name is absolute or climbs by ``..``, a link leads outside, or no file

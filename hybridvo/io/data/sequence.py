@@ -58,7 +58,8 @@ class Sequence:
 
     ``len(sequence)`` is the number of frames, ``sequence[i]`` reads one, and iteration reads all.
     A reader overrides :meth:`_list_files`, which fills in files, time stamps and poses,
-    :meth:`_calibration`, and the methods that read a file where its format is its own.
+    :meth:`_calibration`, and the methods that read a file where its format is its own. A missing
+    image or depth map is a warning, and None in its frame; a frame that lacks both cannot be read.
 
     Attributes:
         root: The folder.
