@@ -18,17 +18,14 @@ from hybridvo.core.calibration import (
     TEXTURE_MIDDLE,
 )
 
-# points of the grid, about
-POINTS = 5000
-
 
 @dataclass(frozen=True, eq=False)
 class Belief:
     """Which parts of a view are static, as frames before have shown.
 
     Attributes:
-        log_odds: (h, w) float16 log odds of each point of :func:`grid_index` to be static; 0 where
-            nothing is known.
+        log_odds: (h, w) float16 log odds of each point of a regular grid to be static
+            (:func:`hybridvo.solver.points.grid_index`); 0 where nothing is known.
         certainty: log odds that the whole belief is right.
     """
 
@@ -74,31 +71,6 @@ class Belief:
         """(h, w) float32 factors on the texture of each point, from 0 to 1."""
         ramp = self.log_odds.astype(np.float32) - TEXTURE_MIDDLE
         return np.asarray(expit(ramp), np.float32)
-
-
-def grid_index(shape: tuple[int, int], points: int = POINTS) -> np.ndarray:
-    """Return the rows and columns (h, w, 2) of a regular grid of pixels of an image (H, W).
-
-    Args:
-        shape: (H, W) of the image.
-        points: about how many there are at most; by default those of a belief.
-
-    Returns:
-        The grid.
-
-    >>> grid_index((480, 640)).shape
-    (60, 80, 2)
-    """
-    height, width = shape
-    step = grid_step(shape, points)
-    first = step // 2
-    rows, columns = np.mgrid[first:height:step, first:width:step]
-    return np.stack([rows, columns], axis=-1)
-
-
-def grid_step(shape: tuple[int, int], points: int) -> int:
-    """Return the distance, px, between the pixels of :func:`grid_index`."""
-    return max(1, round(np.sqrt(shape[0] * shape[1] / points)))
 
 
 def resized(grid: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridvo.core.euler import euler_transform
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
     Motion,
@@ -18,6 +17,7 @@ from hybridvo.core.results import (
 )
 from hybridvo.core.types import FramePair
 from hybridvo.hypotheses.select import ChoiceEvidence
+from hybridvo.network.euler import euler_transform
 from hybridvo.network.hypothesis_maps import HypothesisNetwork
 from hybridvo.network.pair_maps import look_at_pair
 from hybridvo.network.selection import select_pose

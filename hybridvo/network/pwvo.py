@@ -20,10 +20,10 @@ from torch import nn
 
 from hybridvo.core.checks import check_kind
 from hybridvo.core.errors import InputError
-from hybridvo.core.euler import euler_motion
 from hybridvo.core.options import option_group
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import FramePair, PairBatch
+from hybridvo.network.euler import euler_motion
 from hybridvo.network.hypothesis_inputs import (
     HypothesisInputs,
     hypothesis_channels,

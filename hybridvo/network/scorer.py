@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from hybridvo.core.euler import euler_transform
 from hybridvo.core.results import MotionPrior, PixelwisePrediction
 from hybridvo.hypotheses.select import Candidate, RefitStart, Scores
 from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.network.euler import euler_transform
 from hybridvo.network.grid_maps import grid_maps
 from hybridvo.network.hypothesis_inputs import hypothesis_inputs
 from hybridvo.network.hypothesis_maps import (

@@ -25,9 +25,9 @@ import torch.nn.functional as F
 
 from hybridvo.core.checks import as_number, brief, check_kind
 from hybridvo.core.errors import InputError
-from hybridvo.core.euler import euler_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import check_dense
+from hybridvo.network.euler import euler_transform
 from hybridvo.solver.torch.tools import (
     PoseSeed,
     to_tiles,

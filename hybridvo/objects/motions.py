@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from hybridvo.core.belief import grid_index
 from hybridvo.core.geometry import (
     adjoint,
     backproject,
@@ -72,7 +71,7 @@ from hybridvo.objects.calibration import (
 )
 from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.pixels import PixelGrid
-from hybridvo.solver.points import Points
+from hybridvo.solver.points import Points, grid_index
 from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo.solver.refine_images import refine_photometric
 from hybridvo.solver.visibility import visibility

@@ -14,7 +14,6 @@ import numpy as np
 import scipy
 
 from hybridvo.compiled.numba_tools import as_contiguous
-from hybridvo.core.belief import POINTS, grid_step
 from hybridvo.core.geometry import valid_depth
 from hybridvo.core.kept import kept_with, kept_with_frame
 from hybridvo.core.options import RefineOptions
@@ -33,7 +32,7 @@ from hybridvo.solver.plane_kernels import (
     compare_surfaces,
     sum_planes,
 )
-from hybridvo.solver.points import points_of
+from hybridvo.solver.points import POINTS, grid_step, points_of
 from hybridvo.solver.products import weighted_products
 from hybridvo.solver.rows import PLANE_TERMS, PlaneRow
 

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hybridvo.core.belief import POINTS, grid_index, grid_step
 from hybridvo.core.geometry import backproject, valid_depth
 from hybridvo.core.kept import kept_with_frame
 from hybridvo.core.types import Frame
 
+# points of the grid, about
+POINTS = 5000
 # guards divisions
 TINY = 1e-6
 
@@ -46,6 +47,31 @@ class Points(NamedTuple):
         total = cv2.blur(self.on_grid(np.where(counts, values, 0)), (side, side))
         fraction = cv2.blur(self.on_grid(counts), (side, side))
         return np.asarray((total / np.maximum(fraction, TINY))[self.cells])
+
+
+def grid_index(shape: tuple[int, int], points: int = POINTS) -> np.ndarray:
+    """Return the rows and columns (h, w, 2) of a regular grid of pixels of an image (H, W).
+
+    Args:
+        shape: (H, W) of the image.
+        points: about how many there are at most; by default those of a belief.
+
+    Returns:
+        The grid.
+
+    >>> grid_index((480, 640)).shape
+    (60, 80, 2)
+    """
+    height, width = shape
+    step = grid_step(shape, points)
+    first = step // 2
+    rows, columns = np.mgrid[first:height:step, first:width:step]
+    return np.stack([rows, columns], axis=-1)
+
+
+def grid_step(shape: tuple[int, int], points: int) -> int:
+    """Return the distance, px, between the pixels of :func:`grid_index`."""
+    return max(1, round(np.sqrt(shape[0] * shape[1] / points)))
 
 
 def points_of(frame: Frame, count: int = POINTS) -> Points:

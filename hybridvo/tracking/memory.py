@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from scipy.special import logit
 
-from hybridvo.core.belief import Belief, grid_index
+from hybridvo.core.belief import Belief
 from hybridvo.core.geometry import (
     invert,
     transform_points,
@@ -26,7 +26,7 @@ from hybridvo.core.stages import stage
 from hybridvo.core.types import Frame
 from hybridvo.evidence.remembered import Remembered, carried_belief
 from hybridvo.flow.frame_images import blurred, gradient_at
-from hybridvo.solver.points import Points, points_of
+from hybridvo.solver.points import Points, grid_index, points_of
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,

@@ -17,10 +17,10 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.euler import euler_motion
 from hybridvo.core.geometry import pose_matrix
 from hybridvo.core.options import RefineOptions
 from hybridvo.hypotheses.refit import fit_in_mask, mask_weights
+from hybridvo.network.euler import euler_motion
 from hybridvo.network.grid_maps import GridMaps
 from hybridvo.network.hypothesis_inputs import (
     HypothesisInputs,

@@ -14,9 +14,9 @@ from scipy.stats import mannwhitneyu, spearmanr
 from torch.utils.data import default_collate
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.euler import euler_motion, euler_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import PairBatch
+from hybridvo.network.euler import euler_motion, euler_transform
 from hybridvo.network.selection import select_pose
 from hybridvo_lab.calibration import (
     MAX_RIGHT_PX,

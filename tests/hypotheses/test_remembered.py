@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridvo.core.belief import Belief, grid_index
+from hybridvo.core.belief import Belief
 from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.options import Options
 from hybridvo.core.types import Camera, Frame, FramePair
@@ -16,6 +16,7 @@ from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.remembered import memory_scores, on_pixels
 from hybridvo.hypotheses.select import Scores, rank_by_scorer
 from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.solver.points import grid_index
 
 SIZE = (120, 160)
 CAMERA = Camera(160.0, 160.0, 79.5, 59.5, *SIZE)

@@ -12,12 +12,12 @@ import torch
 import torch.nn.functional as F
 
 from hybridvo.api import refine
-from hybridvo.core.euler import euler_motion
 from hybridvo.core.geometry import pixel_grid, se3_exp
 from hybridvo.core.options import Options
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.hypotheses.generate import generate
 from hybridvo.hypotheses.types import HypothesisSet
+from hybridvo.network.euler import euler_motion
 from hybridvo.network.grid_maps import GridMaps, grid_maps
 from hybridvo.network.hypothesis_inputs import (
     RESIDUAL_QUANTILE,

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from hybridvo.core.euler import euler_transform
 from hybridvo.core.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import Camera
+from hybridvo.network.euler import euler_transform
 from hybridvo.network.selection import select_pose
 from hybridvo_lab.paper.losses import LossOptions, LossTargets, total_loss
 

@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridvo.core.euler import euler_motion
 from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.results import PixelwisePrediction
 from hybridvo.core.types import Camera, PairBatch
+from hybridvo.network.euler import euler_motion
 from hybridvo_lab.paper.inputs import NetworkInputs, assemble_inputs
 from hybridvo_lab.paper.losses import LossOptions, LossTargets, total_loss
 from hybridvo_lab.paper.networks import NetworkOptions, build_network

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.euler import euler_motion, euler_transform
 from hybridvo.core.geometry import euler_deg_to_matrix
 from hybridvo.core.results import PixelwisePrediction
+from hybridvo.network.euler import euler_motion, euler_transform
 from hybridvo.network.selection import SELECTION_METHODS, select_pose
 
 

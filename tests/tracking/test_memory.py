@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import hybridvo as hvo
-from hybridvo.core.belief import Belief, grid_index
+from hybridvo.core.belief import Belief
 from hybridvo.core.calibration import MIN_CERTAINTY, MIN_PROBABILITY
 from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.options import Options, TrackOptions
@@ -24,6 +24,7 @@ from hybridvo.judge.probability import probability_of
 from hybridvo.pipeline import sure_alignment
 from hybridvo.run.commands.run import restored, saved
 from hybridvo.solver.align import align_images
+from hybridvo.solver.points import grid_index
 from hybridvo.solver.visibility import visibility
 from hybridvo.tracking.calibration import (
     BELIEF_DECAY,

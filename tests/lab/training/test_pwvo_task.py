@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hybridvo.core.errors import FormatError, InputError
-from hybridvo.core.euler import euler_motion
+from hybridvo.network.euler import euler_motion
 from hybridvo.network.hypothesis_maps import HypothesisMaps
 from hybridvo.network.models import load_weights
 from hybridvo.network.pwvo import PWVOOptions
