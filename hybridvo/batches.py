@@ -29,7 +29,6 @@ from hybridvo.solver.status import FitSummary, degeneracy, status_of
 from hybridvo.solver.torch.backend import BatchSolution, solve_batch
 from hybridvo.solver.torch.batched_pose import BatchedPose
 from hybridvo.solver.torch.factors import Pixels
-from hybridvo.solver.torch.solve import BATCH_STEPS
 from hybridvo.solver.torch.tools import uncompiled
 
 
@@ -105,14 +104,7 @@ def judged_batch(
     stated = solution.stated
     pixels = solution.pixels.map(torch.Tensor.detach)
     T = fit.T
-    statistics = stated.statistics
-    weight = pixels.weight
-    total = weight.sum(dim=1).clamp(min=1e-30)
-    near = (statistics.robust > 0) & (statistics.distance2 <= options.cutoff**2)
-    inlier_ratio = torch.nan_to_num((weight * near).sum(dim=1) / total)
-    robust = statistics.followed(pixels).view_as(batch.depth_prev)
-    followers = robust.sum(dim=(1, 2))
-
+    followers = stated.weights.sum(dim=(1, 2))
     estimates = stated.motions
     probabilities = _probabilities(solution)
     status = []
@@ -120,10 +112,10 @@ def judged_batch(
         failure = _too_few_pixels(batch, pixels, k, options.min_pixels)
         summary = FitSummary(
             is_determined=estimate.tiles > 0,
-            inlier_ratio=float(inlier_ratio[k]),
+            inlier_ratio=float(stated.inlier_ratio[k]),
             followers=float(followers[k]),
             converged=bool(fit.converged[k]),
-            max_steps=BATCH_STEPS,
+            max_steps=fit.max_steps,
             is_seed=bool(fit.is_seed[k]),
         )
         degenerate = degeneracy(estimate, _size(batch), options)
@@ -146,10 +138,10 @@ def judged_batch(
         status=status,
         probability=torch.where(failed, torch.zeros_like(probability), probability),
         iterations=fit.iterations,
-        cost=torch.nan_to_num((weight * statistics.cost).sum(dim=1) / total),
-        weights=robust,
+        cost=stated.cost,
+        weights=stated.weights,
         noise=torch.where(torch.isfinite(noise), noise, torch.ones_like(noise)),
-        inlier_ratio=inlier_ratio,
+        inlier_ratio=stated.inlier_ratio,
         evidence=probabilities.evidence,
     )
 

@@ -39,7 +39,7 @@ from hybridvo.solver.newton import (
     newton,
     tile_size,
 )
-from hybridvo.solver.noise_estimation import Noise, NoiseEstimate, pair_noise
+from hybridvo.solver.noise_estimation import FINAL_NOISE_PIXELS, Noise, pair_noise
 from hybridvo.solver.pixels import PixelGrid, coarse_grid
 from hybridvo.solver.robust_fit import NOISE_TOLERANCE, REESTIMATE_STEPS
 from hybridvo.solver.score_blocks import symmetric
@@ -66,6 +66,7 @@ class Selection:
     Attributes:
         T_curr_prev: (4, 4) metres.
         noise: estimated so far; None: not estimated, and the motion is only a start.
+        is_near: whether the motion, whose noise is not estimated, is right to a pixel.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None.
         coverage: fraction of the usable pixels' weight that the mask leaves.
         evidence: on whether it is the camera's; its type says what it is.
@@ -75,6 +76,7 @@ class Selection:
 
     T_curr_prev: np.ndarray
     noise: Noise | None = None
+    is_near: bool = False
     mask: np.ndarray | None = None
     coverage: float = 1.0
     evidence: tuple[float, ...] = ()
@@ -139,6 +141,51 @@ class FlowFactor:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class FlowFit:
+    """A motion fitted to flow and depth, and what it can be judged by.
+
+    Attributes:
+        T_curr_prev: (4, 4) metres.
+        at: the normal equations there.
+        noise: of flow and depth.
+        stated: the covariance.
+        depths: how the depths of both frames compare along the motion, or None.
+        iterations: Gauss-Newton steps.
+        converged: whether the step that is left is short.
+    """
+
+    T_curr_prev: np.ndarray
+    at: FlowLinearization
+    noise: Noise
+    stated: MotionCovariance
+    depths: DepthAgreement | None
+    iterations: int
+    converged: bool
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Fraction of the weight within the robust kernel's cutoff."""
+        return self.at.inlier_sum / max(self.at.external_sum, 1e-12)
+
+    @property
+    def cost(self) -> float:
+        """Robust cost per unit of weight."""
+        return self.at.cost / max(self.at.external_sum, 1e-12)
+
+    @property
+    def summary(self) -> FitSummary:
+        """What a status follows from."""
+        is_finite = bool(np.isfinite(self.T_curr_prev).all())
+        return FitSummary(
+            is_determined=self.stated.tiles > 0 and is_finite,
+            inlier_ratio=self.inlier_ratio,
+            followers=float(self.at.weights.sum()),
+            converged=self.converged,
+            max_steps=FULL_STEPS,
+        )
+
+
 def refine_pair(
     pair: FramePair,
     start: Selection,
@@ -164,8 +211,42 @@ def refine_pair(
     options = options or RefineOptions()
     if grid is None:
         grid = coarse_grid(pair, weights, options)
-    depth_curr = None if options.current_depth == "off" else pair.curr.depth
+    fit = fit_flow(pair, start, grid, options)
+    degenerate = degeneracy(fit.stated, grid.size, options)
+    status = status_of(fit.summary, fit.depths, degenerate)
+    T = fit.T_curr_prev
+    covariance = fit.stated.covariance
+    if not status.usable:
+        T = np.eye(4)
+        covariance = UNINFORMATIVE_COVARIANCE.copy()
+    return Motion(
+        T_curr_prev=T,
+        covariance=covariance,
+        status=status,
+        inlier_ratio=min(1.0, fit.inlier_ratio * start.coverage),
+        iterations=fit.iterations,
+        cost=fit.cost,
+        residual_scale_px=float(fit.noise.flow_px),
+        depth_noise=float(fit.noise.log_depth),
+        weights=fit.at.weights,
+        evidence=start.evidence,
+        hypotheses=start.hypotheses,
+        terms=(Term.FLOW,),
+    )
 
+
+def fit_flow(
+    pair: FramePair, start: Selection, grid: PixelGrid, options: RefineOptions
+) -> FlowFit:
+    """Fit a motion to flow and depth of all pixels of a pair.
+
+    Args:
+        pair: the pair, with flow and depth.
+        start: the motion to start from; its noise is estimated if it has none.
+        grid: the pixels of the pair.
+        options: of the refinement.
+    """
+    depth_curr = None if options.current_depth == "off" else pair.curr.depth
     pose, first_noise, coarse_steps = _coarse_motion(grid, start, options)
     estimate = pair_noise(
         grid.samples,
@@ -182,27 +263,10 @@ def refine_pair(
     if depth_curr is not None:
         depths = compare_depths(pair, T, fit.at.weights)
     stated = _covariance(grid, fit.at, T, estimate.noise, depths, options)
-    motion = _motion(T, fit.at, estimate).replace(
-        iterations=coarse_steps + steps + fit.iterations,
-        hypotheses=start.hypotheses,
-        evidence=start.evidence,
+    iterations = coarse_steps + steps + fit.iterations
+    return FlowFit(
+        T, fit.at, estimate.noise, stated, depths, iterations, _has_converged(fit)
     )
-    summary = FitSummary(
-        is_determined=stated.tiles > 0 and bool(np.isfinite(T).all()),
-        inlier_ratio=motion.inlier_ratio,
-        followers=float(fit.at.weights.sum()),
-        converged=_has_converged(fit),
-        max_steps=FULL_STEPS,
-    )
-    status = status_of(summary, depths, degeneracy(stated, grid.size, options))
-    inlier_ratio = min(1.0, motion.inlier_ratio * start.coverage)
-    motion = motion.replace(status=status, inlier_ratio=inlier_ratio)
-    if not status.usable:
-        return motion.replace(
-            T_curr_prev=np.eye(4),
-            covariance=UNINFORMATIVE_COVARIANCE.copy(),
-        )
-    return motion.replace(covariance=stated.covariance)
 
 
 def _coarse_motion(
@@ -212,6 +276,16 @@ def _coarse_motion(
     pose = np.array(start.T_curr_prev[:3], np.float64)
     if start.noise is not None:
         return pose, start.noise, start.iterations
+    if start.is_near:
+        noise, _, iterations = robust_fit.reestimate(
+            grid.samples,
+            grid.count,
+            grid.K,
+            options.cutoff,
+            FINAL_NOISE_PIXELS,
+            pose,
+        )
+        return pose, noise, iterations
     fitted, noise, _, iterations = robust_fit.fit_coarse(
         grid.samples, grid.count, grid.K, pose, options.cutoff
     )
@@ -295,19 +369,3 @@ def _shared_errors(
         grid.samples, grid.shape.rows, grid.shape.columns, pose, grid.K, weighting
     )
     return SharedErrors(pulls * at.external_sum, coherent)
-
-
-def _motion(
-    T: np.ndarray, at: FlowLinearization, estimate: NoiseEstimate
-) -> Motion:
-    """Return the motion (4, 4) with what the fit states, but without covariance and status."""
-    total = max(at.external_sum, 1e-12)
-    return Motion(
-        T_curr_prev=T,
-        terms=(Term.FLOW,),
-        inlier_ratio=at.inlier_sum / total,
-        cost=at.cost / total,
-        residual_scale_px=float(estimate.noise.flow_px),
-        depth_noise=float(estimate.noise.log_depth),
-        weights=at.weights,
-    )

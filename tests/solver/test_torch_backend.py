@@ -205,17 +205,16 @@ def test_both_backends_give_the_same_motion(name: str, seed: int) -> None:
         PairBatch.from_pairs([pair]),
         (numba.residual_scale_px, numba.depth_noise),
     )
-    # the last steps differ by the curvature of the weights, which is that of different pixels, and
-    # noise that is estimated anew from another start differs by 1 %
-    for noise in (given, None):
+    # with the noise handed in torch takes other last steps, with the curvature of other pixels;
+    # without, only the start differs
+    for noise, sigmas, part in ((given, 0.04, 0.25), (None, 0.01, 0.002)):
         found = refine_batch(
             batch, start[None], torch.as_tensor(weights)[None], noise=noise
         ).one(0)
         gap = se3_log(found.T_curr_prev @ invert(numba.T_curr_prev))
-        assert np.sqrt(gap @ np.linalg.solve(numba.covariance, gap)) < 0.04
-        # curvature and meat are those of different pixels
+        assert np.sqrt(gap @ np.linalg.solve(numba.covariance, gap)) < sigmas
         np.testing.assert_allclose(
-            np.diag(found.covariance), np.diag(numba.covariance), rtol=0.25
+            np.diag(found.covariance), np.diag(numba.covariance), rtol=part
         )
         assert found.status.state is numba.status.state is State.OK
 

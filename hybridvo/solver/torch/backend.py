@@ -26,7 +26,8 @@ from hybridvo.core.torch_geometry import pp, se3, to_matrix
 from hybridvo.core.types import PairBatch
 from hybridvo.solver.torch import factors
 from hybridvo.solver.torch.batched_pose import BatchedPose
-from hybridvo.solver.torch.covariance import BatchCovariance, batch_covariances
+from hybridvo.solver.torch.by_pairs import BatchStated
+from hybridvo.solver.torch.covariance import batch_covariances
 from hybridvo.solver.torch.factors import KERNELS, Pixels, ResidualModel
 from hybridvo.solver.torch.solve import BatchFit, Starts, solve
 from hybridvo.solver.torch.tools import PoseSeed, as_tensor, checked_batch
@@ -50,7 +51,7 @@ class BatchSolution(NamedTuple):
         batch: checked.
         pixels: of the batch, with gradient.
         fit: the motions.
-        stated: their covariances, and what they rest on.
+        stated: their covariances, and what else the fits state.
         model: the robust kernel, with the noise that was estimated.
         noise: (B, 2) that was handed in, with its gradient; None: none was.
         starts: (B, 7) the first of the motions handed in.
@@ -62,7 +63,7 @@ class BatchSolution(NamedTuple):
     batch: PairBatch
     pixels: Pixels
     fit: BatchFit
-    stated: BatchCovariance
+    stated: BatchStated
     model: ResidualModel
     noise: torch.Tensor | None
     starts: pp.LieTensor
@@ -114,7 +115,9 @@ def solve_batch(
     needs_gradient = _needs_gradient(batch, weights, noise)
     fixed = pixels.map(torch.Tensor.detach)
     with torch.no_grad():
-        fit = solve(batch, fixed, starts, noise, model, options, needs_gradient)
+        fit = solve(
+            batch, weights, fixed, starts, noise, model, options, needs_gradient
+        )
         model = model._replace(noise=fit.noise)
         stated = batch_covariances(batch, fixed, fit, model, options)
     return BatchSolution(

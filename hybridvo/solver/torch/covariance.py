@@ -24,6 +24,7 @@ from hybridvo.solver.pixels import grid_stride
 from hybridvo.solver.score_blocks import UPPER
 from hybridvo.solver.shared_errors import SharedErrors, coherent_fraction
 from hybridvo.solver.torch import factors
+from hybridvo.solver.torch.by_pairs import BatchStated, at_seed, stated_by
 from hybridvo.solver.torch.factors import Pixels, ResidualModel, Weighted
 from hybridvo.solver.torch.solve import BatchFit, coarse_buffers
 from hybridvo.solver.torch.tools import to_tiles
@@ -41,21 +42,13 @@ class PixelStatistics(NamedTuple):
         return torch.nan_to_num(self.robust) * (pixels.weight > 0)
 
 
-class BatchCovariance(NamedTuple):
-    """The covariances of the motions of a batch, and what they rest on."""
-
-    motions: list[MotionCovariance]
-    depths: list[DepthAgreement | None]  # how those of both frames compare
-    statistics: PixelStatistics
-
-
 def batch_covariances(
     batch: PairBatch,
     pixels: Pixels,
     fit: BatchFit,
     model: ResidualModel,
     options: RefineOptions,
-) -> BatchCovariance:
+) -> BatchStated:
     """Return the covariance of every motion, and what a last pass states about the pixels.
 
     Args:
@@ -66,8 +59,11 @@ def batch_covariances(
         options: number of tiles.
     """
     height, width = batch.depth_prev.shape[1:]
-    tile = tile_size((height, width), options.tiles)
     matrix = to_matrix(fit.T)
+    of_seeds = fit.region.covariance_to(fit.solution).cpu().numpy()
+    if fit.by_pair is not None:
+        return _of_pairs(fit, matrix, of_seeds, options, batch.depth_prev)
+    tile = tile_size((height, width), options.tiles)
     sums = []
     pulls = []
     per_pixel = []
@@ -101,14 +97,41 @@ def batch_covariances(
         _sample_covariance(compared, *sample)
         for sample, compared in zip(samples, depths, strict=True)
     ]
-    of_seeds = fit.region.covariance_to(fit.solution).cpu().numpy()
     covariances = [
         checked(estimate.of_seed(of_seed) if kept else estimate, T)
         for estimate, of_seed, kept, T in zip(
             by_pixels, of_seeds, fit.is_seed.tolist(), motions, strict=True
         )
     ]
-    return BatchCovariance(covariances, depths, statistics)
+    weight = pixels.weight
+    total = weight.sum(dim=1).clamp(min=1e-30)
+    near = (statistics.robust > 0) & (statistics.distance2 <= options.cutoff**2)
+    return BatchStated(
+        covariances,
+        depths,
+        robust,
+        torch.nan_to_num((weight * near).sum(dim=1) / total),
+        torch.nan_to_num((weight * statistics.cost).sum(dim=1) / total),
+    )
+
+
+def _of_pairs(
+    fit: BatchFit,
+    matrix: torch.Tensor,
+    of_seeds: np.ndarray,
+    options: RefineOptions,
+    like: torch.Tensor,
+) -> BatchStated:
+    """Return what the fits of a batch state that was answered by pairs, or its seeds."""
+    assert fit.by_pair is not None
+    motions = matrix.double().cpu().numpy()
+    samples = zip(fit.by_pair, fit.is_seed.tolist(), motions, of_seeds, strict=True)
+    fits = [
+        at_seed(each, T, of_seed, options) if each and is_seed else each
+        for each, is_seed, T, of_seed in samples
+    ]
+    stated = stated_by(fits, like)
+    return stated._replace(motions=list(map(checked, stated.motions, motions)))
 
 
 def checked(estimate: MotionCovariance, T: np.ndarray) -> MotionCovariance:

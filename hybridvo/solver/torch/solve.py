@@ -27,13 +27,16 @@ from hybridvo.solver.calibration import (
 )
 from hybridvo.solver.noise_estimation import START_NOISE, Noise, pair_noise
 from hybridvo.solver.pixels import grid_stride
+from hybridvo.solver.refine_flow import FULL_STEPS
 from hybridvo.solver.robust_fit import (
     LARGEST_SCALE_PX,
     SCALE_PER_RESIDUAL,
     SMALLEST_SCALE_PX,
 )
 from hybridvo.solver.torch import factors
+from hybridvo.solver.torch.by_pairs import PairFit, fit_pairs, motions_of
 from hybridvo.solver.torch.factors import (
+    KERNELS,
     MAX_STEP_RATIO,
     NormalEquations,
     Pixels,
@@ -98,7 +101,8 @@ class SearchRegion(NamedTuple):
         """Return the covariance (B, 6, 6) of seeds beside which poses (B, 7) may be right."""
         away = self._away(T)
         covariance, _ = small_inverse(self.information)
-        return covariance + away[:, :, None] * away[:, None, :]
+        even = 0.5 * (covariance + covariance.mT)
+        return even + away[:, :, None] * away[:, None, :]
 
     def _away(self, T: pp.LieTensor) -> torch.Tensor:
         return (T @ self.seed.Inv()).Log().tensor()
@@ -125,10 +129,14 @@ class BatchFit(NamedTuple):
     curvature: torch.Tensor  # (B, 6, 6) of the robust weights
     # (B, 6, 6) covariance of the gradient if errors are independent
     meat: torch.Tensor
+    max_steps: int  # most Newton steps
+    # of the samples alone, where these were fitted one after the other
+    by_pair: list[PairFit | None] | None = None
 
 
 def solve(
     batch: PairBatch,
+    weights: torch.Tensor | None,
     pixels: Pixels,
     starts: Starts,
     noise: torch.Tensor | None,
@@ -140,6 +148,7 @@ def solve(
 
     Args:
         batch: checked.
+        weights: (B, H, W) factors on the information, or None.
         pixels: of the batch, without gradient.
         starts: of every sample.
         noise: (B, 2) handed in; None: it is estimated.
@@ -163,19 +172,34 @@ def solve(
         T = pp.SE3(torch.where(prefers[:, None], by_more.tensor(), T.tensor()))
     followers, rivals = _followers_and_rivals(surest, T, last_scale)
 
-    first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
-    model = model._replace(noise=first_noise)
-    for steps in BATCH_NOISE_STEPS:
-        if noise is None:
-            current = _estimate_noise(batch, pixels, T, model, options)
-        else:
-            current = noise.detach()
+    by_pair = None
+    if noise is None and is_answered_by_pairs(model, weight):
+        by_pair = fit_pairs(batch, weights, T, options)
+        T, current = motions_of(by_pair, T)
         model = model._replace(noise=current)
-        T = factors.gauss_newton(subset, T, partial(_same, model), steps)
+    else:
+        first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
+        model = model._replace(noise=first_noise)
+        for steps in BATCH_NOISE_STEPS:
+            if noise is None:
+                current = _estimate_noise(batch, pixels, T, model, options)
+            else:
+                current = noise.detach()
+            model = model._replace(noise=current)
+            T = factors.gauss_newton(subset, T, partial(_same, model), steps)
 
     curvature, meat = _score_products(subset, pixels, T, model)
-    rested = _newton(pixels, subset, T, model, curvature, exact)
-    solution = rested.state
+    if by_pair is None or exact:
+        rested = _newton(pixels, subset, T, model, curvature, exact)
+        solution = rested.state
+        iterations = rested.iterations
+        converged = rested.converged
+    else:
+        solution = T
+        steps_of = [0 if each is None else each.fit.iterations for each in by_pair]
+        rests = [each is not None and each.fit.converged for each in by_pair]
+        iterations = torch.tensor(steps_of)
+        converged = torch.tensor(rests)
     is_seed = region.distance2(solution) > LARGEST_SOLUTION_DISTANCE2
     T = pp.SE3(
         torch.where(is_seed[:, None], region.seed.tensor(), solution.tensor())
@@ -188,12 +212,19 @@ def solve(
         noise=model.noise,
         followers=followers,
         rivals=rivals,
-        converged=rested.converged,
-        iterations=rested.iterations,
+        converged=converged,
+        iterations=iterations,
         subset=subset,
         curvature=curvature,
         meat=meat,
+        max_steps=BATCH_STEPS if by_pair is None or exact else FULL_STEPS,
+        by_pair=by_pair,
     )
+
+
+def is_answered_by_pairs(model: ResidualModel, weight: torch.Tensor) -> bool:
+    """Return whether each sample gets the fit of a pair: with that kernel, on a CPU."""
+    return model.name == KERNELS[0] and weight.device.type == "cpu"
 
 
 def _prefers_some(pixels: Pixels) -> torch.Tensor:
