@@ -18,6 +18,7 @@ TOOLS = (
     "methods",
     "makers",
     "semi_real",
+    "two_recordings",
     "pwvo_parts",
     "passes",
     "wide_steps",

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,13 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.errors import InputError
-from hybridvo.core.geometry import backproject, invert, rotation_angle, se3_exp
-from hybridvo.core.results import StageFailed
+from hybridvo.core.geometry import backproject, invert, se3_exp
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.flow.providers import FlowProvider, dis_flow, with_flow
-from hybridvo.io.data.open import open_sequence
-from hybridvo.io.data.resize import resize_frame
-from hybridvo.solver.refine_flow import Selection, refine_pair
 from hybridvo_lab.synthetic.draws import (
     draw_mask,
     log_uniform,
@@ -43,14 +39,15 @@ from hybridvo_lab.synthetic.meshes import (
     transformed,
 )
 from hybridvo_lab.synthetic.paper_samples import KnownPair
+from hybridvo_lab.synthetic.recordings import Recording, Source, load_recording
 from hybridvo_lab.synthetic.sensors import depth_jump
 from hybridvo_lab.synthetic.training_scenes import training_scene
 
-PIXELS = (76_800, 172_800)
-"""Pixels of a small and of a large image: 320 x 240, 480 x 360."""
 MARGIN = 0.85
 """Fraction of each side of a frame that is drawn; what lies
 around it may come into view."""
+PIXELS = (76_800, 172_800)
+"""Pixels of a small and of a large image: 320 x 240, 480 x 360."""
 DISTINCT_FRAMES = 12
 """Frames of one recording that are so far apart show different things."""
 NEIGHBOUR_FRACTION = 0.65
@@ -63,10 +60,6 @@ STOP_PROBABILITY = 0.2
 STATIC_PX = 0.5
 """Difference from the ego flow below which a pixel counts as
 static, px at a width of 1024."""
-MIN_INLIER_RATIO = 0.5
-"""Inlier ratio from which a recorded motion that was refined is used."""
-MAX_ROTATION_DIFFERENCE_DEG = 1.0
-"""Largest rotation between recorded and refined motion of a pair that is used."""
 MIN_MEASURED_FRACTION = 0.3
 """Fraction of an object's silhouette that needs a measured depth."""
 NEAR_PROBABILITY = 0.2
@@ -76,22 +69,6 @@ SPARE_OBJECTS = 4
 too little of the image."""
 RENDERED = "rendered"
 """Name of a rendered static scene, in place of a recording's path."""
-
-
-# --- recordings -------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Source:
-    """Frames ``start`` to ``stop`` of a recording below the data folder."""
-
-    path: str
-    start: int = 0
-    stop: int | None = None
-    # between the two frames of a pair; none: single frames only
-    strides: tuple[int, ...] = ()
-    # whether it serves as a static scene; moving objects are cut from all sources
-    is_static: bool = True
 
 
 SPLITS = {
@@ -115,23 +92,6 @@ SPLITS = {
     ),
 }
 """The recordings by what they may be used for. No frame serves in two parts."""
-
-
-class KnownMotion(NamedTuple):
-    """Two frames of a recording, by their index, and the motion between them."""
-
-    prev: int
-    curr: int
-    T_curr_prev: np.ndarray  # (4, 4)
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """The frames of a source, and the pairs of them whose motion is known."""
-
-    source: Source
-    frames: tuple[Frame, ...]  # 1 / MARGIN as large as the images drawn from them
-    pairs: tuple[KnownMotion, ...]
 
 
 class ObjectKind(NamedTuple):
@@ -193,62 +153,9 @@ def load_split(
         raise InputError(
             f"{folder}: no recording of '{split}', such as {SPLITS[split][0].path}."
         )
-    return tuple(_load(Path(folder), source, pixels) for source in present)
-
-
-def _load(folder: Path, source: Source, pixels: int) -> Recording:
-    """Read a recording and refine its motions."""
-    sequence = open_sequence(folder / source.path)
-    poses = sequence.poses
-    if poses is None:
-        raise InputError(
-            f"{source.path}: expected a recording with ground truth, got none."
-        )
-    stop = len(sequence) if source.stop is None else source.stop
-    indices = range(source.start, stop)
-    frames = [_resized(sequence.frame(i), pixels) for i in indices]
-    pairs = []
-    for stride in source.strides:
-        for i in range(len(frames) - stride):
-            j = i + stride
-            stated = invert(poses[indices[j]]) @ poses[indices[i]]
-            T = _refined_motion(frames[i], frames[j], stated)
-            if T is not None:
-                pairs.append(KnownMotion(i, j, T))
-    return Recording(source, tuple(frames), tuple(pairs))
-
-
-def _resized(frame: Frame, pixels: int) -> Frame:
-    """A frame from which images of so many pixels can be drawn, with a margin."""
-    height, width = frame.camera.shape
-    scale = np.sqrt(pixels / (height * width)) / MARGIN
-    return resize_frame(
-        frame, round(scale * height / 2) * 2, round(scale * width / 2) * 2
+    return tuple(
+        load_recording(Path(folder), source, pixels, MARGIN) for source in present
     )
-
-
-def _refined_motion(
-    prev: Frame, curr: Frame, T_stated: np.ndarray
-) -> np.ndarray | None:
-    """Refine a recorded motion, which is often wrong by pixels.
-
-    None where both disagree.
-    """
-    pair = with_flow(FramePair(prev, curr, None), dis_flow())
-    try:
-        refined = refine_pair(pair, Selection(T_stated))
-    except StageFailed:
-        return None
-    if not refined.usable or refined.inlier_ratio < MIN_INLIER_RATIO:
-        return None
-    difference = invert(T_stated) @ refined.T_curr_prev
-    max_length = 0.02 + 0.15 * np.linalg.norm(T_stated[:3, 3])
-    max_angle = np.radians(MAX_ROTATION_DIFFERENCE_DEG)
-    if np.linalg.norm(difference[:3, 3]) > max_length:
-        return None
-    if rotation_angle(difference[:3, :3]) > max_angle:
-        return None
-    return refined.T_curr_prev
 
 
 # --- clips ------------------------------------------------------------------------
