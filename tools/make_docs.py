@@ -33,7 +33,7 @@ PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTAL
 """A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
     "Most of the image moves": ("heavy", "pwvo_parts"),
-    "Real surfaces with moving objects": ("makers", "semi_real"),
+    "Real surfaces with moving objects": ("two_recordings", "makers", "semi_real"),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real", "wide_steps", "tracked_peers"),
     "Whole sequences": ("sequences", "memory", "video_rate", "lost"),

@@ -62,6 +62,7 @@ PARTS = (
     Part("semi_real", "semi_real",
          "--pairs 480 --methods classical,hybrid-flow,hybrid,pwvo-refine,poselib",
          "semi_real", "", 6),
+    Part("two_recordings", "two_recordings", "--clips 40", "two_recordings", "", 5),
     Part("pwvo_parts", "pwvo_parts", "", "pwvo_parts", "", 5),
     Part("sigmas", "sigmas", "--methods hybrid,hybrid-flow --pairs 40", "sigmas", "", 3),
     Part("wide_steps", "wide_steps", "--pairs 16", "wide_steps", "", 3),

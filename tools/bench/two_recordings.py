@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -128,7 +128,11 @@ def tracked(clip: Clip, method: str) -> Iterator[dict[str, Any]]:
         known = between(clip, start, k)
         static = static_part(known)
         row = answer_row(step.motion, known, static)
-        row |= {"ms": digits(ms), "of": whose(step.motion, clip, known, start, k)}
+        of = "world"
+        if row["wrong"]:
+            T_thing = chained(clip.T_thing[start:k])
+            of = "thing" if is_of_thing(step.motion, known, T_thing) else "neither"
+        row |= {"ms": digits(ms), "of": of}
         yield row | {"moving": digits(known.moving.mean()), "step": k}
 
 
@@ -137,28 +141,24 @@ def between(clip: Clip, start: int, stop: int) -> KnownPair:
     known = clip.pairs[start]
     if stop == start + 1:
         return known
-    T = np.eye(4)
-    for each in clip.pairs[start:stop]:
-        T = each.T_curr_prev @ T
+    T = chained([each.T_curr_prev for each in clip.pairs[start:stop]])
     pair = FramePair(known.pair.prev, clip.pairs[stop - 1].pair.curr, None)
     return replace(known, pair=with_flow(pair, dis_flow()), T_curr_prev=T)
 
 
-def whose(motion: Any, clip: Clip, known: KnownPair, start: int, stop: int) -> str:
-    """Whose motion an answer is: ``world``, ``thing``, or ``neither``."""
-    static = static_part(known)
-    error = ego_flow_error(
-        motion.T_curr_prev, known.T_curr_prev, static.depth, known.pair
-    )
-    if error <= allowed_error_px(static.oracle_px):
-        return "world"
+def chained(motions: Sequence[np.ndarray]) -> np.ndarray:
+    """The motion (4, 4) of several, one after the other."""
     T = np.eye(4)
-    for each in clip.T_thing[start:stop]:
+    for each in motions:
         T = each @ T
-    as_world = replace(known, T_curr_prev=T, moving=~known.moving)
-    thing = static_part(as_world)
-    error = ego_flow_error(motion.T_curr_prev, T, thing.depth, known.pair)
-    return "thing" if error <= allowed_error_px(thing.oracle_px) else "neither"
+    return T
+
+
+def is_of_thing(motion: Any, known: KnownPair, T_thing: np.ndarray) -> bool:
+    """Return whether an answer about a pair is the motion of its thing, (4, 4)."""
+    thing = static_part(replace(known, T_curr_prev=T_thing, moving=~known.moving))
+    error = ego_flow_error(motion.T_curr_prev, T_thing, thing.depth, known.pair)
+    return bool(error <= allowed_error_px(thing.oracle_px))
 
 
 # --- figures ----------------------------------------------------------------------
