@@ -39,7 +39,7 @@ from hybridvo.solver.newton import (
     newton,
     tile_size,
 )
-from hybridvo.solver.noise_estimation import FINAL_NOISE_PIXELS, Noise, pair_noise
+from hybridvo.solver.noise_estimation import Noise, pair_noise
 from hybridvo.solver.pixels import PixelGrid, coarse_grid
 from hybridvo.solver.robust_fit import NOISE_TOLERANCE, REESTIMATE_STEPS
 from hybridvo.solver.score_blocks import symmetric
@@ -66,7 +66,6 @@ class Selection:
     Attributes:
         T_curr_prev: (4, 4) metres.
         noise: estimated so far; None: not estimated, and the motion is only a start.
-        is_near: whether the motion, whose noise is not estimated, is right to a pixel.
         mask: (h, w) weights on the coarse grid that it was fitted with, or None.
         coverage: fraction of the usable pixels' weight that the mask leaves.
         evidence: on whether it is the camera's; its type says what it is.
@@ -76,7 +75,6 @@ class Selection:
 
     T_curr_prev: np.ndarray
     noise: Noise | None = None
-    is_near: bool = False
     mask: np.ndarray | None = None
     coverage: float = 1.0
     evidence: tuple[float, ...] = ()
@@ -276,16 +274,6 @@ def _coarse_motion(
     pose = np.array(start.T_curr_prev[:3], np.float64)
     if start.noise is not None:
         return pose, start.noise, start.iterations
-    if start.is_near:
-        noise, _, iterations = robust_fit.reestimate(
-            grid.samples,
-            grid.count,
-            grid.K,
-            options.cutoff,
-            FINAL_NOISE_PIXELS,
-            pose,
-        )
-        return pose, noise, iterations
     fitted, noise, _, iterations = robust_fit.fit_coarse(
         grid.samples, grid.count, grid.K, pose, options.cutoff
     )

@@ -42,17 +42,7 @@ _logger = logging.getLogger(__name__)
 class Tracker:
     """What :class:`hybridvo.Odometry` tracks with: the camera alone, not what else moves.
 
-    Args:
-        network: ``default`` (pretrained), None for the classical refinement alone, the name or
-            file of other PWVO weights, or Models.
-        flow: a callable ``(prev, curr)`` that returns a FlowField or (H, W, 2) px; None: OpenCV's
-            DIS.
-        method: None: ``hybrid``, or ``classical`` without a network.
-        options: the option tree.
-        seed: of the search.
-
-    Raises:
-        InputError: for values of another type, and for an unknown method or network.
+    Its arguments and errors are those of that class.
     """
 
     def __init__(

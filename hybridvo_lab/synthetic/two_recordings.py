@@ -25,7 +25,7 @@ import numpy as np
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import backproject, invert
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.flow.providers import FlowProvider, dis_flow, with_flow
+from hybridvo.flow.providers import dis_flow, with_flow
 from hybridvo_lab.synthetic.draws import smooth_field
 from hybridvo_lab.synthetic.meshes import filled_depth, image_points, transformed
 from hybridvo_lab.synthetic.paper_samples import KnownPair
@@ -95,14 +95,13 @@ class Clip(NamedTuple):
 
 
 def load_places(
-    folder: Path, names: Sequence[str] = tuple(PLACES), pixels: int = PIXELS[1]
+    folder: Path, names: Sequence[str] = tuple(PLACES)
 ) -> dict[str, list[Recording]]:
     """Load the recordings of places that are in a folder.
 
     Args:
         folder: the data folder.
         names: some of :data:`PLACES`.
-        pixels: number of pixels of each image.
 
     Raises:
         InputError: there is no such place.
@@ -117,7 +116,7 @@ def load_places(
         present = [each for each in PLACES[name] if (folder / each.path).is_dir()]
         if present:
             loaded[name] = [
-                load_recording(folder, each, pixels) for each in present
+                load_recording(folder, each, PIXELS[1]) for each in present
             ]
     return loaded
 
@@ -126,7 +125,6 @@ def draw_two_recordings(
     rng: np.random.Generator,
     places: dict[str, list[Recording]],
     frames: int = 2,
-    share: float | None = None,
 ) -> TwoRecordings:
     """Draw a scene of one place, and a part of another place that moves before it.
 
@@ -134,15 +132,13 @@ def draw_two_recordings(
         rng: the source of randomness.
         places: at least two, each with its recordings.
         frames: number of frames of the clip.
-        share: fraction of the image that the outline encloses; None: any of :data:`SHARES`.
 
     Raises:
         InputError: no two of the places can be put together.
     """
     seen = _draw_footage(rng, places, frames)
     world, thing = seen
-    if share is None:
-        share = rng.uniform(*SHARES)
+    share = rng.uniform(*SHARES)
     outline = _draw_outline(rng, world.frames[0].camera.shape, share)
     if rng.random() < BEFORE_PROBABILITY:
         nearness = (0.02, rng.uniform(0.6, 0.95))
@@ -275,14 +271,13 @@ def _draw_outline(
     return (field - np.quantile(field, 1 - share)).astype(np.float32)
 
 
-def compose(parts: TwoRecordings, flow: FlowProvider | None = None) -> Clip:
+def compose(parts: TwoRecordings) -> Clip:
     """Put two recordings together, with DIS flow between neighbouring frames.
 
     Args:
         parts: the two recordings, and the outline.
-        flow: estimates the flow; None: DIS.
     """
-    flow = flow or dis_flow()
+    flow = dis_flow()
     camera = parts.world.frames[0].camera
     scene_depth = [_filled(frame) for frame in parts.world.frames]
     thing_depth = [_filled(frame) for frame in parts.thing.frames]

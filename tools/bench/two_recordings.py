@@ -106,8 +106,6 @@ def clip_rows(args: argparse.Namespace, number: int) -> list[dict[str, Any]]:
             row = {
                 "clip": number,
                 "role": role,
-                "world": each.world.place,
-                "thing": each.thing.place,
                 "known": clip.is_known,
                 "moving": steps[0].pop("moving"),
                 "step": steps[0].pop("step"),

@@ -22,9 +22,11 @@ from hybridvo.solver import kernels
 from hybridvo.solver.covariance import MotionCovariance, unknown_motion
 from hybridvo.solver.depths import DepthAgreement, compare_depths
 from hybridvo.solver.newton import tile_size
-from hybridvo.solver.noise_estimation import START_NOISE
+from hybridvo.solver.noise_estimation import FINAL_NOISE_PIXELS, START_NOISE
 from hybridvo.solver.pixels import PixelGrid, coarse_grid
 from hybridvo.solver.refine_flow import FlowFit, Selection, fit_flow
+from hybridvo.solver.robust_fit import reestimate
+from hybridvo.solver.torch.newton import Rested
 
 
 class PairFit(NamedTuple):
@@ -76,20 +78,30 @@ def fit_pairs(
         except StageFailed:
             fits.append(None)
             continue
-        start = Selection(pose, is_near=True)
+        pixels = (grid.samples, grid.count, grid.K, options.cutoff)
+        # moves the pose
+        noise, _, steps = reestimate(*pixels, FINAL_NOISE_PIXELS, pose[:3])
+        start = Selection(pose, noise, iterations=steps)
         fits.append(PairFit(pair, grid, fit_flow(pair, start, grid, options)))
     return fits
 
 
-def motions_of(
+def rested_at(
     fits: Sequence[PairFit | None], like: pp.LieTensor
-) -> tuple[pp.LieTensor, torch.Tensor]:
-    """Return the motions (B, 7) of fits, and their noise (B, 2); no motion where there is none."""
+) -> tuple[Rested[pp.LieTensor], torch.Tensor]:
+    """Return where fits ended, and their noise (B, 2); at no motion where there is none."""
     poses = [np.eye(4) if each is None else each.fit.T_curr_prev for each in fits]
     noise = [START_NOISE if each is None else each.fit.noise for each in fits]
     matrix = like.tensor().new_tensor(np.stack(poses), dtype=torch.float64)
     T = pp.mat2SE3(matrix, check=False).to(like.dtype)
-    return T, like.tensor().new_tensor(np.array(noise))
+    converged = torch.tensor(
+        [each is not None and each.fit.converged for each in fits]
+    )
+    steps = torch.tensor(
+        [0 if each is None else each.fit.iterations for each in fits]
+    )
+    rested = Rested(T, converged, steps, solved=True)
+    return rested, like.tensor().new_tensor(np.array(noise))
 
 
 def stated_by(fits: Sequence[PairFit | None], like: torch.Tensor) -> BatchStated:

@@ -34,7 +34,7 @@ from hybridvo.solver.robust_fit import (
     SMALLEST_SCALE_PX,
 )
 from hybridvo.solver.torch import factors
-from hybridvo.solver.torch.by_pairs import PairFit, fit_pairs, motions_of
+from hybridvo.solver.torch.by_pairs import PairFit, fit_pairs, rested_at
 from hybridvo.solver.torch.factors import (
     KERNELS,
     MAX_STEP_RATIO,
@@ -175,7 +175,8 @@ def solve(
     by_pair = None
     if noise is None and is_answered_by_pairs(model, weight):
         by_pair = fit_pairs(batch, weights, T, options)
-        T, current = motions_of(by_pair, T)
+        rested, current = rested_at(by_pair, T)
+        T = rested.state
         model = model._replace(noise=current)
     else:
         first_noise = weight.new_tensor(list(START_NOISE)).repeat(len(T), 1)
@@ -191,15 +192,7 @@ def solve(
     curvature, meat = _score_products(subset, pixels, T, model)
     if by_pair is None or exact:
         rested = _newton(pixels, subset, T, model, curvature, exact)
-        solution = rested.state
-        iterations = rested.iterations
-        converged = rested.converged
-    else:
-        solution = T
-        steps_of = [0 if each is None else each.fit.iterations for each in by_pair]
-        rests = [each is not None and each.fit.converged for each in by_pair]
-        iterations = torch.tensor(steps_of)
-        converged = torch.tensor(rests)
+    solution = rested.state
     is_seed = region.distance2(solution) > LARGEST_SOLUTION_DISTANCE2
     T = pp.SE3(
         torch.where(is_seed[:, None], region.seed.tensor(), solution.tensor())
@@ -212,8 +205,8 @@ def solve(
         noise=model.noise,
         followers=followers,
         rivals=rivals,
-        converged=converged,
-        iterations=iterations,
+        converged=rested.converged,
+        iterations=rested.iterations,
         subset=subset,
         curvature=curvature,
         meat=meat,
