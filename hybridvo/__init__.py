@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.core.results import MovingObject as MovingObject
     from hybridvo.core.results import Reason as Reason
     from hybridvo.core.results import RelativePose as RelativePose
+    from hybridvo.core.results import Rival as Rival
     from hybridvo.core.results import State as State
     from hybridvo.core.results import Status as Status
     from hybridvo.core.results import Step as Step
@@ -55,7 +56,7 @@ _HOME = {
     for module, names in {
         "core.types": "Camera Frame FramePair PairBatch",
         "core.results": (
-            "Edge MotionPrior MovingObject Reason RelativePose State Status Step"
+            "Edge MotionPrior MovingObject Reason RelativePose Rival State Status Step"
         ),
         "core.imu": "ImuSamples",
         "core.laboratory": "evaluate",

@@ -28,6 +28,7 @@ from hybridvo.core.results import (
     MotionPrior,
     Reason,
     RelativePose,
+    Rival,
     StageFailed,
     Status,
     Term,
@@ -49,6 +50,7 @@ from hybridvo.hypotheses.select import (
     rank_by_scorer,
     select_by_cues,
     select_from,
+    select_rival,
 )
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.probability import probability_of, surest_evidence
@@ -234,8 +236,24 @@ def surest_look(looks: Sequence[Look]) -> Look:
 @stage("solve")
 def solve_in_numba(looks: Sequence[Look], ctx: Context) -> Motion:
     """Select the camera's motion from all looks, and fit it inside its static mask."""
-    chosen = select_from([look.ranking for look in looks])
-    return fit(surest_look(looks).flow, chosen, ctx)
+    rankings = [look.ranking for look in looks]
+    motion = fit(surest_look(looks).flow, select_from(rankings), ctx)
+    if probability_of(motion.evidence) >= ctx.options.select.min_probability:
+        return motion
+    return motion.replace(rivals=fitted_rival(looks, ctx))
+
+
+def fitted_rival(looks: Sequence[Look], ctx: Context) -> tuple[Rival, ...]:
+    """The motion that may be the camera's instead of the selected one; empty where none is."""
+    rival = select_rival([look.ranking for look in looks])
+    if rival is None:
+        return ()
+    ranking, selection = rival
+    flow = next(look.flow for look in looks if look.ranking is ranking)
+    other = fit(flow, selection, ctx)
+    if not other.usable:
+        return ()
+    return (Rival(other.T_curr_prev, other.covariance, other.evidence),)
 
 
 @stage("solve")

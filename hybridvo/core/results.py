@@ -231,6 +231,31 @@ class PhotometricReport:
     agreement: float = 1.0
 
 
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """One of several motions of a pair that may be the camera's: a mode of its distribution.
+
+    Attributes:
+        T_curr_prev: (4, 4) metres.
+        covariance: (6, 6) of delta in ``Exp(delta) T_curr_prev``, if it is the camera's.
+        evidence: what speaks for it, see :attr:`Motion.evidence`.
+        probability: that it is the camera's; those of all rivals sum to at most one.
+
+    >>> Rival(np.eye(4), 1e-6 * np.eye(6), probability=0.6).T_prev_curr.shape
+    (4, 4)
+    """
+
+    T_curr_prev: np.ndarray
+    covariance: np.ndarray
+    evidence: tuple[float, ...] = ()
+    probability: float = 0.0
+
+    @property
+    def T_prev_curr(self) -> np.ndarray:
+        """The inverse (4, 4), as expected by the "between" factors of pose graphs."""
+        return invert(self.T_curr_prev)
+
+
 class Term(enum.StrEnum):
     """What a motion is based on."""
 
@@ -268,6 +293,7 @@ class Motion:
     weights: np.ndarray | None = None
     evidence: tuple[float, ...] = ()
     hypotheses: tuple[Hypothesis, ...] = ()
+    rivals: tuple[Rival, ...] = ()
     terms: tuple[Term, ...] = ()
     photometric: PhotometricReport | None = None
 
@@ -326,6 +352,9 @@ class RelativePose(Motion):
         evidence: the numbers from which the probability is computed, if any. Their type says
             what they are, see :mod:`hybridvo.judge.probability`.
         hypotheses: every strong motion that was found, the selected one first.
+        rivals: where it is degraded as an ambiguous motion: this motion as it was fitted, and the
+            other one that may be the camera's, with their probabilities. The covariance above
+            covers both.
         terms: what the motion is based on.
         photometric: what the photometric refinement did; None if it was not tried.
         probability: probability that this is the camera's motion rather than an

@@ -267,19 +267,62 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
 def evidence_on_choice(rankings: Sequence[Ranking]) -> ChoiceEvidence:
     """Return what speaks for the motion that is selected from looks at all flows so far."""
     look = surest(rankings)
-    chosen = look.described(look.best)
     rival = best_rival(rankings)
-    rival_share = 0.0 if rival is None else float(np.mean(rival.inliers))
     return ChoiceEvidence(
         margin=margin_of(rankings),
         first_margin=rankings[0].margin,
-        log_share=float(np.log(np.mean(chosen.inliers) + LEAST_SHARE)),
-        log_rival_share=float(np.log(rival_share + LEAST_SHARE)),
+        log_share=_log_share(look, look.best),
+        log_rival_share=_log_share(*rival) if rival else float(np.log(LEAST_SHARE)),
     )
 
 
-def best_rival(rankings: Sequence[Ranking]) -> Hypothesis | None:
-    """Return the best motion that differs from the one selected; None where there is none."""
+def _log_share(look: Ranking, number: int) -> float:
+    """Log of the fraction of the view that follows a candidate."""
+    share = np.mean(look.described(number).inliers)
+    return float(np.log(share + LEAST_SHARE))
+
+
+def select_rival(
+    rankings: Sequence[Ranking],
+) -> tuple[Ranking, Selection] | None:
+    """Select the best motion that differs from the one of :func:`select_from`.
+
+    Its evidence is that on the choice with the parts of both exchanged.
+
+    Args:
+        rankings: a look at each flow so far.
+
+    Returns:
+        The look in which it was found, and the motion with the mask to fit it in; None where
+        there is no other one.
+    """
+    rival = best_rival(rankings)
+    if rival is None:
+        return None
+    look, number = rival
+    on_choice = evidence_on_choice(rankings)
+    evidence = ChoiceEvidence(
+        -on_choice.margin,
+        -on_choice.first_margin,
+        on_choice.log_rival_share,
+        on_choice.log_share,
+    )
+    candidate = look.candidates[number]
+    mask = look.mask_of(number)
+    return look, Selection(
+        T_curr_prev=pose_matrix(candidate.pose),
+        noise=Noise(*candidate.noise),
+        mask=mask,
+        coverage=mask_coverage(look.found.grid, mask),
+        evidence=evidence,
+        iterations=candidate.iterations,
+    )
+
+
+def best_rival(rankings: Sequence[Ranking]) -> tuple[Ranking, int] | None:
+    """Return the best motion that differs from the one selected, by its look and number there;
+    None where there is none.
+    """
     chosen = surest(rankings)
     everyone = [
         (r, number) for r in rankings for number in range(len(r.candidates))
@@ -290,8 +333,7 @@ def best_rival(rankings: Sequence[Ranking]) -> Hypothesis | None:
     rivals = np.flatnonzero(away > DISTINCT_MOTION_PX)
     if not len(rivals):
         return None
-    ranking, number = everyone[rivals[np.argmax(scores[rivals])]]
-    return ranking.described(number)
+    return everyone[rivals[np.argmax(scores[rivals])]]
 
 
 def rank_by_scorer(

@@ -54,7 +54,8 @@ def others_possible(motion: RelativePose) -> Finding:
     It adds the second moment of a mixture: where this motion is wrong, the camera's is taken to
     be as far away as the farthest of the others.
     """
-    others = [h.T_curr_prev for h in motion.hypotheses[1:]] + [np.eye(4)]
+    others = [h.T_curr_prev for h in motion.hypotheses[1:]]
+    others += [rival.T_curr_prev for rival in motion.rivals] + [np.eye(4)]
     steps = np.array([se3_log(motion.T_curr_prev @ invert(T)) for T in others])
     translation2 = np.max(np.sum(steps[:, :3] ** 2, axis=1))
     rotation2 = np.max(np.sum(steps[:, 3:] ** 2, axis=1))

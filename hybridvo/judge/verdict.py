@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from hybridvo.core.calibration import MIN_PROBABILITY
 from hybridvo.core.depth_units import depth_unit_warning
-from hybridvo.core.results import Motion, Reason, RelativePose, Status
+from hybridvo.core.results import Motion, Reason, RelativePose, Rival, Status
 from hybridvo.core.stages import stage
 from hybridvo.evidence.pair import PairEvidence
 from hybridvo.judge.calibration import DIRECT_INFLATION, NO_MOTION_PROBABILITY
@@ -121,8 +121,22 @@ def _as_probable_as_stated(motion: RelativePose) -> RelativePose:
     if motion.probability < NO_MOTION_PROBABILITY and is_doubted_for_that:
         return with_finding(motion, improbable(motion))
     if reason is Reason.AMBIGUOUS_MOTION:
+        motion = motion.replace(rivals=_with_odds(motion))
         return with_finding(motion, others_possible(motion))
-    return motion
+    return motion.replace(rivals=())
+
+
+def _with_odds(motion: RelativePose) -> tuple[Rival, ...]:
+    """A motion and its rival with their probabilities; empty where it has none."""
+    if not motion.rivals:
+        return ()
+    p = motion.probability
+    itself = Rival(motion.T_curr_prev, motion.covariance, motion.evidence, p)
+    others = [
+        replace(each, probability=min(1 - p, probability_of(each.evidence)))
+        for each in motion.rivals
+    ]
+    return (itself, *others)
 
 
 def with_finding(motion: RelativePose, finding: Finding | None) -> RelativePose:

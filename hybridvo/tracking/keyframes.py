@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -116,21 +117,34 @@ def between_frames(
         noise. Its weights stand on the reference's pixels.
     """
     T_key_ref = invert(keyframe.T_world_cam) @ reference.T_world_cam
-    T_curr_ref = motion.T_curr_prev @ T_key_ref
     known = reference.covariance
     if reference.origin != keyframe.count:
         # both stem from an earlier keyframe: the error of this one counts as well
         back = adjoint(invert(T_key_ref))
         known = known + back @ keyframe.covariance @ back.T
-    A = adjoint(T_curr_ref)
-    covariance = (1 - KEYFRAME_CORRELATION) * (motion.covariance + A @ known @ A.T)
+
+    def between(T_curr_key: np.ndarray, covariance: np.ndarray) -> dict[str, Any]:
+        T_curr_ref = T_curr_key @ T_key_ref
+        A = adjoint(T_curr_ref)
+        both = covariance + A @ known @ A.T
+        return {
+            "T_curr_prev": T_curr_ref,
+            "covariance": (1 - KEYFRAME_CORRELATION) * both,
+        }
+
+    rivals = [
+        replace(each, **between(each.T_curr_prev, each.covariance))
+        for each in motion.rivals
+    ]
     weights = motion.weights
     if weights is not None and reference.frame.depth is not None:
         weights = carried_weights(
             weights, keyframe.frame, reference.frame, T_key_ref
         )
     return motion.replace(
-        T_curr_prev=T_curr_ref, covariance=covariance, weights=weights
+        **between(motion.T_curr_prev, motion.covariance),
+        weights=weights,
+        rivals=tuple(rivals),
     )
 
 
