@@ -84,7 +84,11 @@ CUES = "CUES_RIGHT"
 """Answers by cues; these and the next names are those of the numbers that are fitted."""
 CHOICE = "CHOICE_RIGHT"
 """Motions chosen among all that were found, after each flow."""
-MOVING_REAL = ("clips, box", "semi-real, development")
+MOVING_REAL = (
+    "clips, box",
+    "semi-real, development",
+    "two recordings, development",
+)
 """Makers of real views in which something moves, on which alone choices often fail."""
 STILL_WEIGHT = 0.1
 """By how much each other maker counts beside one of these in the fit of choices."""
@@ -142,6 +146,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--pairs", type=int, default=200, help="of makers without a fixed number")
     add("--cues", action="store_true", help="fit the weights of the cues alone")
     add("--direct", action="store_true", help="fit the direct motions alone")
+    add("--choice", action="store_true", help="fit the choices of PWVO alone")
     add("--weights", metavar="FILE", help="of PWVO, in place of the shipped ones")
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR")
     add(
@@ -175,6 +180,11 @@ def main(argv: list[str] | None = None) -> int:
             row = Labelled(evidence, error_px <= limit, case.maker)
             rows.setdefault(name, []).append(row)
 
+    if args.choice:
+        for case in development_cases(args):
+            keep(case, chosen_answers(case, models))
+        report(CHOICE, rows[CHOICE])
+        return 0
     for case in cases_of(CALIBRATION, args):
         keep(case, direct_answers(case))
         if not args.direct:
@@ -341,12 +351,17 @@ def sparse(depth: np.ndarray) -> np.ndarray:
 
 
 def answers(case: Case, models: Models) -> Iterator[Answer]:
-    """The answers by cues, and by PWVO's scores after each source."""
+    """The answers by cues, and by PWVO's scores."""
+    yield from cue_answers(case)
+    yield from chosen_answers(case, models)
+
+
+def chosen_answers(case: Case, models: Models) -> Iterator[Answer]:
+    """The answers by PWVO's scores after each source."""
     ctx = Context(models=models)
     evidence = ctx.evidence(case.pair)
     if search_of(evidence) is None:
         return
-    yield from cue_answers(case)
     # after each source: what is stated then must be right then
     for motion in by_flow(evidence, ctx):
         if motion.usable:

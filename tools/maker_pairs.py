@@ -32,6 +32,11 @@ from hybridvo_lab.synthetic.turned_windows import (
     draw_turned_window,
     load_tripod,
 )
+from hybridvo_lab.synthetic.two_recordings import (
+    compose,
+    draw_two_recordings,
+    load_places,
+)
 
 
 class Film(NamedTuple):
@@ -324,7 +329,22 @@ def semi_real(data: Path, split: str, count: int) -> Iterator[KnownPair]:
         yield draw(split, number, recordings)
 
 
+def two_recordings(data: Path, split: str, count: int) -> Iterator[KnownPair]:
+    """Pairs of two recordings in one view, every second one with exchanged roles."""
+    places = load_places(data, (split,))
+    if len(places) < 2:
+        return
+    for number in range((count + 1) // 2):
+        rng = np.random.default_rng([CALIBRATION_SEED, number])
+        parts = draw_two_recordings(rng, places)
+        for each in (parts, parts.exchanged()):
+            yield compose(each).pairs[0]
+
+
 CALIBRATION: dict[str, Maker] = {
+    "two recordings, development": lambda data, n: two_recordings(
+        data, "development", n
+    ),
     "semi-real, development": lambda data, n: semi_real(data, "development", n),
     "clips, box": lambda data, n: clips(data, "box"),
     "tripod, books": lambda data, n: turned_windows(
@@ -379,6 +399,7 @@ FILMS: dict[str, Callable[[Path], Iterator[Film]]] = {
 """Frames of a camera in the hand or on a tripod, in which a tracker remembers what is static. On
 these the probability of a motion of what is believed static is fitted."""
 TEST: dict[str, Maker] = {
+    "two recordings": lambda data, n: two_recordings(data, "test", n),
     "semi-real": lambda data, n: semi_real(data, "test", n),
     "clips, kitchen": lambda data, n: clips(data, "kitchen"),
     "bare walls": lambda data, n: bare_walls(range(9300, 9300 + max(1, n // 5))),

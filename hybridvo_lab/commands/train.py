@@ -6,7 +6,7 @@ import functools
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +27,7 @@ from hybridvo_lab.synthetic.dataset import load_preset, read_sample, write_sampl
 from hybridvo_lab.synthetic.paper_samples import Sample, rays
 from hybridvo_lab.synthetic.semi_real import PIXELS, Recording, load_split
 from hybridvo_lab.synthetic.turned_windows import TripodRecording, load_tripod
+from hybridvo_lab.synthetic.two_recordings import load_places
 from hybridvo_lab.training import ranks
 from hybridvo_lab.training.hypothesis_samples import (
     PER_SHARD,
@@ -306,12 +307,14 @@ def _draw_shard(shard: _Shard) -> int:
         return int(before["samples"])
     # The shards come in two sizes, in turns.
     pixels = PIXELS[shard.seed // PER_SHARD % 2]
-    static: tuple[Recording, ...] = ()
-    tripod: Sequence[TripodRecording] = ()
+    makers = Makers(shares=shard.shares)
     if shard.recordings is not None:
-        static = load_split(shard.recordings, "train", pixels)
-        tripod = _tripod(shard.recordings)
-    makers = Makers(static, tripod, shard.shares)
+        makers = Makers(
+            load_split(shard.recordings, "train", pixels),
+            _tripod(shard.recordings),
+            _places(shard.recordings, pixels),
+            shard.shares,
+        )
     samples = write_shard(shard.data, shard.seed, makers)
     write_json(path, {"samples": samples, **made_by})
     return samples
@@ -329,3 +332,9 @@ def _finished_shard(path: Path) -> dict[str, Any]:
 def _tripod(recordings: Path) -> Sequence[TripodRecording]:
     """Return the recordings of a tripod, which a process reads once."""
     return load_tripod(recordings / "tripod")
+
+
+@functools.cache
+def _places(recordings: Path, pixels: int) -> Mapping[str, Sequence[Recording]]:
+    """Return the recordings by place, which a process reads once."""
+    return load_places(recordings, ("train",), pixels)

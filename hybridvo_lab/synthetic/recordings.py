@@ -41,6 +41,35 @@ class Source:
     is_static: bool = True
 
 
+SPLITS = {
+    "train": {
+        "rooms, begin": (Source("real_static/rooms_110", 0, 45, (1,)),),
+        "rooms, middle": (Source("real_static/rooms_110", 45, 90, (1,)),),
+        "living room": (Source("tum/redwood_livingroom_5", strides=(1, 2, 3)),),
+        "desk, turning": (
+            Source("tum/rgbd_dataset_freiburg1_rpy_100", strides=(1, 2)),
+        ),
+        "house": (Source("tartanair_v2/P000", strides=(1,)),),
+    },
+    "development": {
+        "rooms, end": (Source("real_static/rooms_110", 93, 110, (1,)),),
+        "desk": (
+            Source("tum/rgbd_dataset_freiburg1_xyz_first10", strides=(1, 2, 3, 4)),
+        ),
+    },
+    "test": {
+        "street": (Source("real_dynamic/kitti06_stereo", strides=(1,)),),
+        "scanned room": (Source("devices/scannet_sensreader", strides=(1,)),),
+        "studio": (Source("real_dynamic/adt_slam_left"),),
+        "people": (Source("real_dynamic/jvosf_two_people_moving"),),
+        "robot": (Source("real_dynamic/jvosf_robot"),),
+        "door": (Source("real_dynamic/jvosf_opening_door", is_static=False),),
+        "cars": (Source("real_dynamic/kitti02_stereo", is_static=False),),
+    },
+}
+"""The recordings of each place, by what they may be used for. No frame serves in two parts."""
+
+
 class KnownMotion(NamedTuple):
     """Two frames of a recording, by their index, and the motion between them."""
 

@@ -39,7 +39,7 @@ from hybridvo_lab.synthetic.meshes import (
     transformed,
 )
 from hybridvo_lab.synthetic.paper_samples import KnownPair
-from hybridvo_lab.synthetic.recordings import Recording, Source, load_recording
+from hybridvo_lab.synthetic.recordings import SPLITS, Recording, load_recording
 from hybridvo_lab.synthetic.sensors import depth_jump
 from hybridvo_lab.synthetic.training_scenes import training_scene
 
@@ -69,29 +69,6 @@ SPARE_OBJECTS = 4
 too little of the image."""
 RENDERED = "rendered"
 """Name of a rendered static scene, in place of a recording's path."""
-
-
-SPLITS = {
-    "train": (
-        Source("real_static/rooms_110", 0, 90, (1,)),
-        Source("tum/redwood_livingroom_5", strides=(1, 2, 3)),
-    ),
-    "development": (
-        Source("real_static/rooms_110", 93, 110, (1,)),
-        Source("tum/rgbd_dataset_freiburg1_xyz_first10", strides=(1, 2, 3, 4)),
-    ),
-    "test": (
-        Source("tum/rgbd_dataset_freiburg1_rpy_100", strides=(1, 2)),
-        Source("tartanair_v2/P000", strides=(1,)),
-        Source("real_dynamic/kitti06_stereo", strides=(1,)),
-        Source("real_dynamic/adt_slam_left"),
-        Source("real_dynamic/jvosf_two_people_moving"),
-        Source("real_dynamic/jvosf_robot"),
-        Source("real_dynamic/jvosf_opening_door", is_static=False),
-        Source("real_dynamic/kitti02_stereo", is_static=False),
-    ),
-}
-"""The recordings by what they may be used for. No frame serves in two parts."""
 
 
 class ObjectKind(NamedTuple):
@@ -135,7 +112,8 @@ class Views(NamedTuple):
 def load_split(
     folder: str | Path, split: str, pixels: int = PIXELS[0]
 ) -> tuple[Recording, ...]:
-    """Load the recordings of a part of :data:`SPLITS` that are in a folder.
+    """Load the recordings of a part of
+    :data:`~hybridvo_lab.synthetic.recordings.SPLITS` that are in a folder.
 
     Args:
         folder: the data folder.
@@ -148,10 +126,13 @@ def load_split(
     """
     if split not in SPLITS:
         raise InputError(f"split: expected {', '.join(SPLITS)}, got {split!r}.")
-    present = [s for s in SPLITS[split] if (Path(folder) / s.path).is_dir()]
+    sources = [source for place in SPLITS[split].values() for source in place]
+    present = [
+        source for source in sources if (Path(folder) / source.path).is_dir()
+    ]
     if not any(source.is_static for source in present):
         raise InputError(
-            f"{folder}: no recording of '{split}', such as {SPLITS[split][0].path}."
+            f"{folder}: no recording of '{split}', such as {sources[0].path}."
         )
     return tuple(
         load_recording(Path(folder), source, pixels, MARGIN) for source in present

@@ -14,7 +14,7 @@ or reaches into it; that changes no flow.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -25,33 +25,17 @@ import numpy as np
 from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import backproject, invert
 from hybridvo.core.types import Camera, Frame, FramePair
-from hybridvo.flow.providers import dis_flow, with_flow
+from hybridvo.flow.providers import FlowProvider, dis_flow, with_flow
 from hybridvo_lab.synthetic.draws import smooth_field
 from hybridvo_lab.synthetic.meshes import filled_depth, image_points, transformed
 from hybridvo_lab.synthetic.paper_samples import KnownPair
-from hybridvo_lab.synthetic.recordings import Recording, Source, load_recording
+from hybridvo_lab.synthetic.recordings import SPLITS, Recording, load_recording
 from hybridvo_lab.synthetic.semi_real import PIXELS, STATIC_PX
 
-PLACES = {
-    "rooms, begin": (Source("real_static/rooms_110", 0, 36, (1,)),),
-    "rooms, middle": (Source("real_static/rooms_110", 37, 73, (1,)),),
-    "rooms, end": (Source("real_static/rooms_110", 74, 110, (1,)),),
-    "desk": (
-        Source("tum/rgbd_dataset_freiburg1_xyz_first10", strides=(1, 2, 3)),
-        Source("tum/rgbd_dataset_freiburg1_rpy_100", strides=(1, 2)),
-    ),
-    "living room": (Source("tum/redwood_livingroom_5", strides=(1, 2, 3)),),
-    "house": (Source("tartanair_v2/P000", strides=(1,)),),
-    "street": (Source("real_dynamic/kitti06_stereo", strides=(1,)),),
-    "scanned room": (Source("devices/scannet_sensreader", strides=(1,)),),
-}
-"""The recordings of each place in which nothing moves and whose motions are known."""
 MIN_SIZE = (110, 150)
 """Smallest image that both recordings fill, rows and columns."""
 SHARES = (0.05, 0.95)
 """Fraction of the image that the outline encloses."""
-BEFORE_PROBABILITY = 0.6
-"""Probability that the part stands before all of the scene."""
 HOLD_PROBABILITY = 0.25
 """Probability that a recording is held from one frame of a clip to the next."""
 SURROUNDS = 0.75
@@ -60,6 +44,22 @@ MAX_DRAWS = 300
 """Draws of two recordings after which they count as impossible to put together."""
 SHARPNESS = 1.2
 """How many times coarser an image may become without being blurred before."""
+
+
+class Layout(NamedTuple):
+    """Where things are drawn."""
+
+    # probabilities of an outline in the middle, on one side, around the middle
+    outlines: tuple[float, float, float]
+    # a and b of the beta distribution of the fraction of the image between both SHARES
+    share: tuple[float, float]
+    before: float  # probability that the part stands before all of the scene
+
+
+EVERY = Layout((1 / 3, 1 / 3, 1 / 3), (1, 1), 0.6)
+"""The scene may as well be what moves: its share is that of the thing, and so is its border."""
+USUAL = Layout((0.6, 0.3, 0.1), (1.5, 2.5), 0.85)
+"""The scene mostly surrounds the thing, is larger, and is farther away."""
 
 
 class Footage(NamedTuple):
@@ -95,36 +95,39 @@ class Clip(NamedTuple):
 
 
 def load_places(
-    folder: Path, names: Sequence[str] = tuple(PLACES)
+    folder: Path, splits: Sequence[str], pixels: int = PIXELS[1]
 ) -> dict[str, list[Recording]]:
-    """Load the recordings of places that are in a folder.
+    """Load the recordings with known motions of parts of
+    :data:`~hybridvo_lab.synthetic.recordings.SPLITS` that are in a folder.
 
     Args:
         folder: the data folder.
-        names: some of :data:`PLACES`.
+        splits: some of ``train``, ``development`` and ``test``.
+        pixels: number of pixels of their images.
 
-    Raises:
-        InputError: there is no such place.
+    Returns:
+        By place.
     """
-    unknown = sorted(set(names) - set(PLACES))
-    if unknown:
-        raise InputError(
-            f"places: expected some of {'; '.join(PLACES)}, got {unknown[0]!r}."
-        )
     loaded = {}
-    for name in names:
-        present = [each for each in PLACES[name] if (folder / each.path).is_dir()]
+    places = [place for split in splits for place in SPLITS[split].items()]
+    for place, sources in places:
+        present = [
+            source
+            for source in sources
+            if source.strides and (folder / source.path).is_dir()
+        ]
         if present:
-            loaded[name] = [
-                load_recording(folder, each, PIXELS[1]) for each in present
+            loaded[place] = [
+                load_recording(folder, each, pixels) for each in present
             ]
     return loaded
 
 
 def draw_two_recordings(
     rng: np.random.Generator,
-    places: dict[str, list[Recording]],
+    places: Mapping[str, Sequence[Recording]],
     frames: int = 2,
+    layout: Layout = EVERY,
 ) -> TwoRecordings:
     """Draw a scene of one place, and a part of another place that moves before it.
 
@@ -132,15 +135,18 @@ def draw_two_recordings(
         rng: the source of randomness.
         places: at least two, each with its recordings.
         frames: number of frames of the clip.
+        layout: where the part is drawn.
 
     Raises:
         InputError: no two of the places can be put together.
     """
     seen = _draw_footage(rng, places, frames)
     world, thing = seen
-    share = rng.uniform(*SHARES)
-    outline = _draw_outline(rng, world.frames[0].camera.shape, share)
-    if rng.random() < BEFORE_PROBABILITY:
+    least, most = SHARES
+    share = least + (most - least) * rng.beta(*layout.share)
+    kind = int(rng.choice(3, p=layout.outlines))
+    outline = _draw_outline(rng, world.frames[0].camera.shape, kind, share)
+    if rng.random() < layout.before:
         nearness = (0.02, rng.uniform(0.6, 0.95))
     else:
         nearness = (0.5, rng.uniform(0.9, 1.3))
@@ -148,7 +154,7 @@ def draw_two_recordings(
 
 
 def _draw_footage(
-    rng: np.random.Generator, places: dict[str, list[Recording]], frames: int
+    rng: np.random.Generator, places: Mapping[str, Sequence[Recording]], frames: int
 ) -> tuple[Footage, Footage]:
     """A scene and another recording, as one camera sees them."""
     names = list(places)
@@ -169,7 +175,10 @@ def _draw_footage(
 
 
 def _draw_walk(
-    rng: np.random.Generator, place: str, recordings: list[Recording], frames: int
+    rng: np.random.Generator,
+    place: str,
+    recordings: Sequence[Recording],
+    frames: int,
 ) -> Footage | None:
     """Frames of a recording, forwards or backwards, some of them held.
 
@@ -254,10 +263,10 @@ def _resampled(frame: Frame, camera: Camera) -> Frame:
 
 
 def _draw_outline(
-    rng: np.random.Generator, shape: tuple[int, int], share: float
+    rng: np.random.Generator, shape: tuple[int, int], kind: int, share: float
 ) -> np.ndarray:
-    """A field (H, W) that is positive in a fraction of the image: in its middle, on one side of it,
-    or around its middle.
+    """A field (H, W) that is positive in a fraction of the image: in its middle (kind 0), on one
+    side of it (1), or around its middle (2).
     """
     height, width = shape
     v, u = np.mgrid[:height, :width].astype(np.float32)
@@ -266,18 +275,19 @@ def _draw_outline(
     angle = rng.uniform(0, 2 * np.pi)
     side = 2 * (np.cos(angle) * x + np.sin(angle) * y)
     distance = np.hypot(x, y)
-    field = (-distance, side, distance)[int(rng.integers(3))]
+    field = (-distance, side, distance)[kind]
     field = field + rng.uniform(0.02, 0.12) * smooth_field(rng, shape, 5)
     return (field - np.quantile(field, 1 - share)).astype(np.float32)
 
 
-def compose(parts: TwoRecordings) -> Clip:
-    """Put two recordings together, with DIS flow between neighbouring frames.
+def compose(parts: TwoRecordings, flow: FlowProvider | None = None) -> Clip:
+    """Put two recordings together, with flow between neighbouring frames.
 
     Args:
         parts: the two recordings, and the outline.
+        flow: estimates the flow; None: DIS.
     """
-    flow = dis_flow()
+    flow = flow or dis_flow()
     camera = parts.world.frames[0].camera
     scene_depth = [_filled(frame) for frame in parts.world.frames]
     thing_depth = [_filled(frame) for frame in parts.thing.frames]

@@ -8,7 +8,7 @@ Shards are written atomically: a training can read them while others are written
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,6 +44,11 @@ from hybridvo_lab.synthetic.turned_windows import (
     TripodRecording,
     draw_turned_window,
 )
+from hybridvo_lab.synthetic.two_recordings import (
+    USUAL,
+    compose,
+    draw_two_recordings,
+)
 from hybridvo_lab.training.validation import allowed_error_px
 
 PER_SHARD = 64
@@ -76,9 +81,12 @@ UNKNOWN = 255
 class Shares(NamedTuple):
     """Which makers the samples are of; what is left is rendered."""
 
-    tripod: float = 0.15  # of the samples: from recordings of a tripod
-    semi_real: float = 0.5  # from other recordings, in which pieces move
+    tripod: float = 0.1  # of the samples: from recordings of a tripod
+    semi_real: float = 0.4  # from other recordings, in which pieces move
     of_kind: float = 0.6  # of these: objects of one of ``semi_real.OBJECT_KINDS``
+    two_recordings: float = (
+        0.2  # of the samples: part of a place before another one
+    )
 
 
 class Makers(NamedTuple):
@@ -86,11 +94,13 @@ class Makers(NamedTuple):
 
     static: Sequence[Recording] = ()  # static scenes, and things that are cut out
     tripod: Sequence[TripodRecording] = ()  # people before a camera that stands
+    # by place, the static scenes whose motions are known
+    places: Mapping[str, Sequence[Recording]] = {}
     shares: Shares = Shares()
 
 
 def draw_samples(seed: int, makers: Makers) -> list[dict[str, Any]]:
-    """Samples of one seed: of one semi-real or recorded pair, or two of a rendered view."""
+    """Samples of one seed: of one semi-real or recorded pair, or two of a view."""
     rng = np.random.default_rng([0x50570, seed])
     samples = []
     for drawn in _draw_pairs(rng, makers):
@@ -125,6 +135,13 @@ def _draw_pairs(rng: np.random.Generator, makers: Makers) -> list[KnownPair]:
             of_kind=shares.of_kind,
             flow=estimate_flow,
         )
+    part = shares.tripod + shares.semi_real + shares.two_recordings
+    if makers.places and kind < part:
+        parts = draw_two_recordings(rng, makers.places, layout=USUAL)
+        clips = [
+            compose(each, estimate_flow) for each in (parts, parts.exchanged())
+        ]
+        return [clip.pairs[0] for clip in clips]
     height, width = SIZES[int(rng.integers(len(SIZES)))]
     if rng.random() < UNDETERMINED_FRACTION:
         return [undetermined_pair(rng, height, width)]
@@ -201,7 +218,8 @@ def _record(drawn: KnownPair, found: HypothesisSet) -> dict[str, Any]:
         flow, truth = (
             camera_flow(K, drawn.depth, T)[0] for T in (pose, drawn.T_curr_prev)
         )
-        error = np.linalg.norm(flow - truth, axis=2)[drawn.depth > 0].mean()
+        is_static = (drawn.depth > 0) & ~drawn.moving
+        error = np.linalg.norm(flow - truth, axis=2)[is_static].mean()
         error *= REFERENCE_WIDTH / drawn.depth.shape[1]
         limit = allowed_error_px(float(np.nan_to_num(error)))
     count = min(len(found.motions), MAX_MOTIONS)

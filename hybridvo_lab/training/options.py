@@ -126,6 +126,7 @@ class PWVOTrainingOptions(TrainingRun):
     """
 
     network: PWVOOptions = PWVOOptions()
+    layers: Literal["all", "score"] = "all"  # which are trained
     refits: Count = 2
     mask_weight: NotNegative = 1.0
     pose_weight: NotNegative = 0.1

@@ -222,8 +222,14 @@ def _read_shard(path: Path) -> dict[str, np.ndarray]:
 def ego_flow_error(
     pose: torch.Tensor, owner: torch.Tensor, batch: HypothesisBatch
 ) -> torch.Tensor:
-    """(N,) mean ego-flow error of the poses, px at a width of 1024."""
+    """(N,) mean ego-flow error of the poses, px at a width of 1024.
+
+    Over the static pixels; over all where none is static.
+    """
     z = batch.depth_true[:, ::2, ::2].flatten(1)
+    static = batch.label[:, ::2, ::2].flatten(1) == STATIC
+    has_static = (static & (z > 0)).any(1, keepdim=True)
+    z = torch.where(static | ~has_static, z, 0.0)
     ray = batch.inputs.ray[:, :, ::2, ::2].flatten(2)
     points = torch.cat([ray, torch.ones_like(ray[:, :1])], 1) * z[:, None]
     focal = batch.inputs.K[:, :2, None]
@@ -420,6 +426,14 @@ class PWVOTask:
         self.data = str(folder)
         torch.manual_seed(options.seed)
         self.network = PWVO(options.network)
+        if options.layers == "score":
+            self.network.requires_grad_(False)
+            for layer in (
+                self.network.summary,
+                self.network.inner,
+                self.network.score,
+            ):
+                layer.requires_grad_(True)
 
     def batches(self, samples: int, workers: int) -> Iterator[HypothesisBatch]:
         """Yield batches of the samples of shards, which are chosen and shuffled in each round.

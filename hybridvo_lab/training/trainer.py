@@ -78,7 +78,11 @@ class _Loss(nn.Module):
         loss, parts = self._task.loss(batch, step)
         if ranks.count() > 1:
             # every parameter needs a gradient, also where a part of a batch is empty
-            sums = [parameter.sum() for parameter in self.network.parameters()]
+            sums = [
+                parameter.sum()
+                for parameter in self.network.parameters()
+                if parameter.requires_grad
+            ]
             loss = loss + 0.0 * torch.stack(sums).sum()
         return loss, parts
 
@@ -122,7 +126,7 @@ class Trainer:
         self.exported = copy.deepcopy(self.network).requires_grad_(False)
         optimizer = self.options.optimizer
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(),
+            [each for each in self.network.parameters() if each.requires_grad],
             optimizer.learning_rate,
             optimizer.betas,
             weight_decay=optimizer.weight_decay,

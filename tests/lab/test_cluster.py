@@ -141,7 +141,7 @@ def test_finished_shards_are_not_drawn_again(
     }
     assert sorted(drawn) == [64, 128, 192]
     # with other shares they are others
-    shares = (0.0, 0.5, 0.5)
+    shares = (0.0, 0.5, 0.5, 0.1)
     draw_training_samples(tmp_path, 64, 64, shares=shares, workers=threads)
     assert drawn[3:] == [64]
 

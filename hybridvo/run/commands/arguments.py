@@ -636,8 +636,8 @@ TRAIN_SAMPLES = command(
     ),
     number(
         "--shares SHARE",
-        "of tripod recordings, semi-real pairs, objects of a kind in these, and pairs with "
-        "exchanged roles",
+        "of tripod recordings, semi-real pairs, objects of a kind in these, and two "
+        "recordings in one view",
         nargs="+",
         default=(),
     ),

@@ -13,11 +13,9 @@ from hybridvo.core.geometry import ego_flow
 from hybridvo.core.types import Camera, Frame
 from hybridvo_lab.synthetic import semi_real
 from hybridvo_lab.synthetic.meshes import Canvas
+from hybridvo_lab.synthetic.recordings import SPLITS, Recording, Source
 from hybridvo_lab.synthetic.semi_real import (
     OBJECT_KINDS,
-    SPLITS,
-    Recording,
-    Source,
     draw_clip,
     load_split,
 )
@@ -125,8 +123,10 @@ def test_the_pairs_of_a_clip_share_their_frames_and_objects_stop_and_start(
 
 def test_no_frame_serves_in_two_parts() -> None:
     used: dict[str, list[tuple[float, str]]] = {}
-    for split, sources in SPLITS.items():
-        for source in sources:
+    for split, places in SPLITS.items():
+        for source in (
+            source for of_place in places.values() for source in of_place
+        ):
             stop = np.inf if source.stop is None else source.stop
             for start, other_stop, other in used.setdefault(source.path, []):
                 assert other == split or source.start >= other_stop or stop <= start

@@ -44,7 +44,7 @@ def drawn(seed: int, frames: int = 2) -> TwoRecordings:
     rng = np.random.default_rng(seed)
     parts = draw_two_recordings(rng, places(), frames)
     shape = parts.world.frames[0].camera.shape
-    outline = _draw_outline(rng, shape, 0.4)
+    outline = _draw_outline(rng, shape, 1, 0.4)
     return parts._replace(outline=outline, nearness=(0.0, 0.5))
 
 
@@ -105,9 +105,13 @@ def test_what_lies_along_the_border_is_known_to_be_the_scene() -> None:
         assert compose(parts._replace(outline=outline)).is_known == is_known
 
 
-@given(share=st.floats(0.05, 0.95), seed=st.integers(0, 10_000))
-def test_an_outline_encloses_its_share(share: float, seed: int) -> None:
-    outline = _draw_outline(np.random.default_rng(seed), (60, 80), share)
+@given(
+    share=st.floats(0.05, 0.95),
+    kind=st.integers(0, 2),
+    seed=st.integers(0, 10_000),
+)
+def test_an_outline_encloses_its_share(share: float, kind: int, seed: int) -> None:
+    outline = _draw_outline(np.random.default_rng(seed), (60, 80), kind, share)
     assert np.mean(outline > 0) == pytest.approx(share, abs=0.01)
 
 
@@ -123,9 +127,7 @@ def test_longer_clips_follow_the_outline_and_hold_frames() -> None:
 
 
 def test_places_that_cannot_be_put_together_are_named(tmp_path: Path) -> None:
-    assert load_places(tmp_path) == {}
-    with pytest.raises(InputError, match=r"expected some of .*, got 'moon'"):
-        load_places(tmp_path, ("moon",))
+    assert load_places(tmp_path, ("test",)) == {}
     rng = np.random.default_rng(0)
     with pytest.raises(InputError, match="at least two, got 1"):
         draw_two_recordings(rng, places(1))

@@ -104,8 +104,47 @@ def test_training_learns_and_goes_on(shards, tmp_path):
         next(PWVOTask(options, tmp_path / "nothing").batches(0, 0))
 
 
-def test_the_configuration_is_that_of_the_pretrained_network():
-    options = load_training_options(CONFIG)
+def test_the_score_alone_is_trained(shards, tmp_path):
+    options = PWVOTrainingOptions(
+        network=PWVOOptions(width=0.25), batch_size=4, layers="score"
+    )
+    trainer = Trainer(PWVOTask(options, shards), tmp_path)
+    before = {
+        name: value.clone() for name, value in trainer.network.state_dict().items()
+    }
+    trainer.update(next(trainer.task.batches(0, 0)), 0.5)
+    after = trainer.network.state_dict()
+    changed = {
+        name.split(".")[0]
+        for name in before
+        if not torch.equal(before[name], after[name])
+    }
+    # the last layer begins at zero: what is before it has no gradient yet
+    assert "score" in changed
+    assert changed <= {"summary", "inner", "score"}
+
+
+def test_the_error_is_that_of_the_static_pixels(batch):
+    """Things that move say nothing about the camera, unless nothing stands."""
+    owner = torch.arange(len(batch))
+    pose = batch.T.clone()
+    pose[:, :, 3] += 0.05
+    expected = ego_flow_error(pose, owner, batch)
+    is_static = batch.label == hypothesis_samples.STATIC
+    farther = torch.where(is_static, batch.depth_true, 10 * batch.depth_true)
+    changed = dataclasses.replace(batch, depth_true=farther)
+    has_static = is_static[:, ::2, ::2].flatten(1).any(1)
+    assert has_static.any()
+    got = ego_flow_error(pose, owner, changed)
+    torch.testing.assert_close(got[has_static], expected[has_static])
+    nothing = torch.full_like(batch.label, hypothesis_samples.MOVING)
+    moving = dataclasses.replace(batch, label=nothing)
+    assert (ego_flow_error(pose, owner, moving) > 0).all()
+
+
+@pytest.mark.parametrize("name", ["train_pwvo.yaml", "train_score.yaml"])
+def test_the_configuration_is_that_of_the_pretrained_network(name):
+    options = load_training_options(CONFIG.with_name(name))
     network, _ = load_weights("pwvo")
     assert options.network == network.options
 
