@@ -73,9 +73,10 @@ UNDETERMINED_EVERY = 5
 """A scene in which no part follows the camera for so many pairs of a maker."""
 TINY = 1e-9
 """What keeps a logarithm finite."""
-RIDGE = 1e-4
-"""Penalty on the squared slopes of evidence of unit variance,
-times the number of answers."""
+RIDGE = 1e-3
+"""Penalty on the squared slopes of evidence of unit variance, times the number of answers."""
+CUES_RIGHT_RIDGE = 1e-4
+"""The same for the answers by cues."""
 CUE_RIDGE = 0.02
 """The same for the weights of the cues."""
 SCENARIO_SEEDS = range(500, 512)
@@ -84,16 +85,6 @@ CUES = "CUES_RIGHT"
 """Answers by cues; these and the next names are those of the numbers that are fitted."""
 CHOICE = "CHOICE_RIGHT"
 """Motions chosen among all that were found, after each flow."""
-MOVING_REAL = (
-    "clips, box",
-    "semi-real, development",
-    "two recordings, development",
-)
-"""Makers of real views in which something moves, on which alone choices often fail."""
-STILL_WEIGHT = 0.1
-"""By how much each other maker counts beside one of these in the fit of choices."""
-CHOICE_RIDGE = 0.015
-"""Penalty on the squared slopes of the evidence on choices."""
 DIRECT = "DIRECT_EXACT, DIRECT_OF_SCENE"
 """Direct motions: that they are exact, and that they are the scene's."""
 RIGHT_DIRECT = 0.25 / 320
@@ -103,8 +94,6 @@ NO_BELIEF = np.nan
 """In place of a belief's certainty, where all of the view was asked."""
 POINTS = 1500
 """Points of a film's frame, about, on which the error of a motion is measured."""
-DIRECT_RIDGE = 1e-3
-"""Penalty on the squared slopes of the evidence on direct motions."""
 DIRECT_STARTS = ((-1.0, 1.0, 1.0), (-0.5, 2.0, 1.0), (0.0, 1.0, 2.0))
 """Slopes and the two constants from which that fit starts."""
 
@@ -424,11 +413,8 @@ def fit_of(
     counts = maker_weights(list(makers))
     if name == DIRECT:
         return fit_direct(evidence[:, :-1], evidence[:, -1], right, counts)
-    if name != CHOICE:
-        return (fit(evidence, right, counts),)
-    is_moving = np.array([maker in MOVING_REAL for maker in makers])
-    counts = counts * np.where(is_moving, 1.0, STILL_WEIGHT)
-    return (fit(evidence, right, counts / counts.mean(), CHOICE_RIDGE),)
+    ridge = CUES_RIGHT_RIDGE if name == CUES else RIDGE
+    return (fit(evidence, right, counts, ridge),)
 
 
 def stated(evidence: np.ndarray, weights: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -472,7 +458,7 @@ def fit(
         evidence: (N, k).
         right: (N,) bool.
         counts: (N,) by how much each answer counts.
-        ridge: penalty on the squared slopes of evidence of unit variance.
+        ridge: see :data:`RIDGE`.
 
     Returns:
         (k + 1,) weights; the last one is the constant.
@@ -540,7 +526,7 @@ def fit_direct(
         p = np.clip(stated, TINY, 1 - TINY)
         loss = -counts * np.log(np.where(right, p, 1 - p))
         slopes = np.append(exact[:-1], of_scene[:-1])
-        return float(loss.mean() + DIRECT_RIDGE * slopes @ slopes / 2)
+        return float(loss.mean() + RIDGE * slopes @ slopes / 2)
 
     tries = []
     for slope, exact_constant, scene_constant in DIRECT_STARTS:

@@ -69,10 +69,10 @@ def choice_probability(evidence: ChoiceEvidence) -> float:
 
     >>> alone = ChoiceEvidence(6.0, 6.0, -0.1, -4.6)
     >>> round(choice_probability(alone), 2)
-    0.98
+    0.99
     >>> as_good = ChoiceEvidence(0.0, 0.0, -0.7, -0.7)
     >>> round(choice_probability(as_good), 2)
-    0.59
+    0.42
     """
     return logistic(evidence, CHOICE_RIGHT)
 
