@@ -50,7 +50,7 @@ MIN_COVERAGE = 0.02
 
 # Wide steps
 
-MATCH_RATIO = 0.8
+MATCH_RATIO = 0.85
 """Largest ratio of the distances of the best and the second best match (Lowe, IJCV 2004)."""
 MATCH_RESIDUAL_PX = 2.0
 """Largest residual of a match that follows a motion, px at a width of 640."""

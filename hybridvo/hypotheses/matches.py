@@ -28,12 +28,10 @@ from hybridvo.hypotheses.calibration import (
     MATCH_RESIDUAL_PX,
 )
 
-# SIFT features of an image, for a step that flow cannot follow: 40 ms on one core. Chosen by
-# hand, as all of this section; ``tools/benchmark.py wide_steps`` shows the effect of a change.
-MATCH_FEATURES = 800
-# Width to which images are reduced before features are matched, px: 35 ms instead of 90 for a
-# pair at 640x480, and as many wide steps are right (78 and 77 of 86).
-MATCH_WIDTH = 400.0
+# SIFT features of an image at most, for a step that flow cannot follow.
+MATCH_FEATURES = 2000
+# Contrast of a feature at least, where OpenCV asks for .04: bare rooms have few with more.
+MATCH_CONTRAST = 0.01
 # Motions of a pair that are sought: the scene's, and a moving object's before it.
 MATCH_MAX_MOTIONS = 2
 
@@ -124,18 +122,12 @@ def match_features(pair: FramePair) -> Matches:
 
 @kept_with_frame
 def find_features(frame: Frame) -> Features:
-    """The features of a frame's image, which is reduced to :data:`MATCH_WIDTH`."""
-    factor = min(1.0, MATCH_WIDTH / frame.camera.width)
-    image = grey_bytes(frame)
-    if factor < 1:
-        image = cv2.resize(
-            image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA
-        )
-    detector = cv2.SIFT.create(MATCH_FEATURES)
-    keypoints, descriptors = detector.detectAndCompute(image, None)
-    pixels = np.array([point.pt for point in keypoints]).reshape(-1, 2)
-    # pixel (0, 0) is the centre of the first pixel of either size
-    return Features((pixels + 0.5) / factor - 0.5, descriptors)
+    """The features of a frame's image."""
+    detector = cv2.SIFT.create(MATCH_FEATURES, contrastThreshold=MATCH_CONTRAST)
+    keypoints, descriptors = detector.detectAndCompute(grey_bytes(frame), None)
+    return Features(
+        np.array([point.pt for point in keypoints]).reshape(-1, 2), descriptors
+    )
 
 
 def _solve(
