@@ -59,6 +59,8 @@ class Reason(enum.Enum):
     REPEATED_FRAME = "repeated_frame"
     # the depth map is a plane that the images do not show
     FALSE_DEPTH = "false_depth"
+    # something nearer hides the static scene
+    HIDDEN_WORLD = "hidden_world"
     # an object's pixels do not follow one rigid motion
     NOT_RIGID = "not_rigid"
 

@@ -37,6 +37,19 @@ next three; ``make golden`` shows the effect of a change."""
 CHANGE_INFLATION = 2.0
 """Factor on the mean square of the changes in the prior: a larger one may come."""
 
+# -- what hides the static scene ---------------------------------------------------------
+
+MOSTLY_HIDDEN = 0.85
+"""Fraction of what was believed static from which it is hidden: what fills the view is then no
+scene. By hand, as the next three."""
+HARDLY_HIDDEN = 0.2
+"""That up to which what a tracker remembers is all of the scene, and later frames are held against
+it."""
+MIN_WORLD_IN_VIEW = 0.2
+"""Fraction of a remembered view that must be inside the current one before it says anything."""
+MAX_HIDDEN_FRAMES = 90
+"""Frames for which a hidden scene is waited for, three seconds at 30 Hz."""
+
 # -- depth whose scale changes from frame to frame ---------------------------------------
 
 DEPTH_SCALE_STD = 0.05

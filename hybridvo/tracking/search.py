@@ -193,7 +193,9 @@ class Pairs:
         expected = self._expected_from(reference)
         if expected is not None:
             T_ahead = chain(T_ahead, expected.T_curr_prev)
-        return trimmed(keyframes, T_ahead, self.state.count)
+        # nothing was seen of the scene since it is hidden
+        seen = self.state.count - self.state.hidden
+        return trimmed(keyframes, T_ahead, seen)
 
     def _T_ref_start(self, start: Keyframe) -> np.ndarray:
         """(4, 4) motion from a start to the reference."""
@@ -299,7 +301,7 @@ def from_place(
         # nothing is expected of the motion from there
         pair = FramePair(place.frame, arrival.frame, None)
         evidence = setup.context.evidence(pair)
-        if best.motion.usable:
+        if best.motion.usable and not state.hidden:
             motion = pipeline.by_first_source(evidence, setup.method, setup.context)
         else:
             motion = pipeline.run_method(

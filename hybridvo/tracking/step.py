@@ -13,7 +13,16 @@ from dataclasses import replace
 import numpy as np
 
 from hybridvo.core.geometry import chain, invert, se3_exp, se3_log
-from hybridvo.core.results import Edge, MotionPrior, Reason, RelativePose, Step
+from hybridvo.core.results import (
+    Edge,
+    Motion,
+    MotionPrior,
+    Reason,
+    RelativePose,
+    Status,
+    Step,
+    Term,
+)
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.evidence.one_time import (
     is_of_one_time,
@@ -21,7 +30,11 @@ from hybridvo.evidence.one_time import (
     rough_motion,
 )
 from hybridvo.flow.providers import has_texture
+from hybridvo.judge.verdict import believed
+from hybridvo.solver.depth_alone import DepthEvidence
+from hybridvo.tracking.calibration import HARDLY_HIDDEN, MOSTLY_HIDDEN
 from hybridvo.tracking.depth_scale import ScaleFilter, divided, measured_scale
+from hybridvo.tracking.hidden_world import hidden_by
 from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,
@@ -86,6 +99,9 @@ def keep(
     leads = arrival.flow is not None or becomes_reference(
         setup, frame, found, state.gap
     )
+    hidden = hidden_by(state, arrival.frame, estimate)
+    if hidden >= MOSTLY_HIDDEN:
+        return _behind_something(setup, state, arrival, estimate)
     if not found.usable:
         return _held(setup, state, arrival, estimate, leads)
     origin = origin_of(state, estimate)
@@ -103,7 +119,7 @@ def keep(
         found.covariance,
         found.ok,
     )
-    after = known_path(state, estimate)
+    after = replace(known_path(state, estimate), hidden=0)
     is_sure = leads and found.ok and setup.spans_frames
     if is_sure and frame.rgb is not None and has_enough_depth(frame):
         after = replace(
@@ -118,6 +134,10 @@ def keep(
         motion_model=velocity_after(state, estimate, origin, motion),
         memory=learned(setup, state, frame, estimate),
     )
+    memory = after.memory
+    is_seen = found.ok and hidden < HARDLY_HIDDEN
+    if is_seen and memory is not None and memory.belief.is_ready:
+        after = replace(after, world=memory)
     after = after.advanced(new.T_world_cam, new if leads else None, motion.terms)
     step = step_of(frame, new.T_world_cam, motion, origin.frame.index)
     return after, replace(step, measured=measured)
@@ -219,7 +239,7 @@ def learned(
     setup: Setup, state: TrackerState, frame: Frame, estimate: Estimate
 ) -> Memory | None:
     """What is remembered after a frame, on the oldest keyframe in use; None: nothing."""
-    if not setup.remembers or estimate.is_relocalized:
+    if not setup.remembers or (estimate.is_relocalized and not state.hidden):
         return None
     home = min(
         (*estimate.keyframes, state.known_reference),
@@ -257,6 +277,42 @@ def _carried_by_depth(
     after = after.advanced(T_world_cam, new if leads else None, terms)
     index = estimate.start.frame.index
     return after, step_of(frame, T_world_cam, estimate.motion, index)
+
+
+def _behind_something(
+    setup: Setup, state: TrackerState, arrival: Arrival, estimate: Estimate
+) -> tuple[TrackerState, Step]:
+    """What follows from a frame in which something nearer hides the static scene.
+
+    Later motions start from where the scene was last seen.
+    """
+    frame = arrival.frame
+    T_world_cam, motion = fallback(setup, state, estimate.motion, arrival.given)
+    how = "is held" if arrival.given is None else "is as given"
+    if setup.options.track.on_failure == "constant_velocity":
+        how = "goes on with constant velocity"
+    text = f"something nearer hides what was seen to stand; the path {how}"
+    motion = believed(
+        Motion(
+            motion.T_curr_prev,
+            motion.covariance,
+            Status.degraded(Reason.HIDDEN_WORLD, text),
+            evidence=DepthEvidence(),
+            terms=(Term.EXPECTED,),
+        )
+    ).replace(method=setup.method)
+    world = state.world
+    assert world is not None
+    model = state.motion_model
+    after = replace(
+        state,
+        motion_model=replace(model, failed=model.failed + 1),
+        keyframes=(world.keyframe,),
+        memory=world,
+        hidden=state.hidden + 1,
+    )
+    index = state.known_reference.frame.index
+    return after.advanced(T_world_cam), step_of(frame, T_world_cam, motion, index)
 
 
 def _held(

@@ -58,6 +58,8 @@ class TrackerState:
         T_world_last: (4, 4) pose of the last step.
         count: frames so far.
         found_by: what the last motion is based on; nothing where it failed.
+        world: what was believed static when hardly any of it was hidden.
+        hidden: frames since something nearer hides it; 0: nothing does.
         sensors: what is known of the camera beside that.
     """
 
@@ -70,6 +72,8 @@ class TrackerState:
     T_world_last: np.ndarray = field(default_factory=lambda: np.eye(4))
     count: int = 0
     found_by: tuple[Term, ...] = ()
+    world: Memory | None = None
+    hidden: int = 0
     sensors: Sensors = field(default_factory=Sensors)
 
     @property
@@ -206,6 +210,7 @@ class TrackerState:
             keyframes=tuple(each.moved(T_new_old) for each in self.keyframes),
             places=tuple(each.moved(T_new_old) for each in self.places),
             memory=None if self.memory is None else self.memory.moved(T_new_old),
+            world=None if self.world is None else self.world.moved(T_new_old),
             sensors=sensors,
         )
 

@@ -31,6 +31,9 @@ ADVICE = {
         "the depth map is a bare plane, and the images show a scene; check the file, the network "
         "or the sensor that it comes from"
     ),
+    Reason.HIDDEN_WORLD: (
+        "something nearer hid what was seen to stand; the pose is held until it is seen again"
+    ),
     Reason.LOW_INLIERS: (
         "few pixels follow one motion; look for blur, wrong flow or depth of another moment"
     ),
