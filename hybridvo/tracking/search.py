@@ -154,7 +154,11 @@ def find(setup: Setup, state: TrackerState, arrival: Arrival) -> Estimate:
     # a place costs as much as the frame did
     is_over = pipeline.is_late(arrival.deadline)
     if arrival.flow is None and pairs.is_lost(motion) and not is_over:
-        return from_place(setup, state, arrival, found) or found
+        return (
+            from_place(setup, state, arrival, found)
+            or from_failed(setup, state, arrival)
+            or found
+        )
     return found
 
 
@@ -284,6 +288,22 @@ class Pairs:
         is_sure = state.known_reference.is_sure
         was_unsure = not is_sure or state.motion_model.failed > 0
         return not motion.usable or was_unsure
+
+
+def from_failed(
+    setup: Setup, state: TrackerState, arrival: Arrival
+) -> Estimate | None:
+    """The motion from a frame to which none was found, if it is sure.
+
+    The step to that frame may have been too wide; the one over both frames is wider still.
+    """
+    if state.failed is None:
+        return None
+    pair = FramePair(state.failed.frame, arrival.frame, None)
+    motion = pipeline.run_method(
+        setup.context.evidence(pair), setup.method, setup.context, arrival.deadline
+    )
+    return Estimate(state.failed, motion, ()) if motion.ok else None
 
 
 def from_place(

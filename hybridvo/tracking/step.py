@@ -93,6 +93,8 @@ def keep(
     """
     frame = arrival.frame
     found = estimate.motion
+    if estimate.start is state.failed:
+        state = state.after_gap()
     if found.is_by_depth_alone:
         return _carried_by_depth(state, frame, estimate)
     # flow from elsewhere leads from each frame to the next one
@@ -336,6 +338,8 @@ def _held(
     )
     new = state.unsure(frame, T_world_cam)
     after = after.advanced(T_world_cam, new if leads else None)
+    if not leads and arrival.given is None and has_enough_depth(frame):
+        after = replace(after, failed=new)
     origin = state.known_reference.frame.index
     return after, step_of(frame, T_world_cam, motion, origin)
 

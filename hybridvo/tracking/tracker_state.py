@@ -52,6 +52,7 @@ class TrackerState:
         reference: from which the next motion starts; None before the first frame.
         keyframes: oldest first.
         places: from which a lost path is found again.
+        failed: the frame before where no motion to it was found, with the pose that is held.
         part: number of the first frame that leads here: no motion is known from earlier ones.
         memory: which parts of the view are static.
         motion_model: what is expected of the next motion.
@@ -66,6 +67,7 @@ class TrackerState:
     reference: Keyframe | None = None
     keyframes: tuple[Keyframe, ...] = ()
     places: tuple[Keyframe, ...] = ()
+    failed: Keyframe | None = None
     part: int = 0
     memory: Memory | None = None
     motion_model: MotionModel = field(default_factory=MotionModel)
@@ -104,8 +106,7 @@ class TrackerState:
     def starts(self) -> dict[int, Frame]:
         """The frames from which the next motion may start, by their index."""
         held = [*self.places, *self.keyframes]
-        if self.reference is not None:
-            held.append(self.reference)
+        held += [each for each in (self.reference, self.failed) if each is not None]
         return {each.frame.index: each.frame for each in held}
 
     @property
@@ -161,7 +162,22 @@ class TrackerState:
             T_world_last=T_world_cam,
             count=self.count + 1,
             reference=reference or self.reference,
+            failed=None,
             found_by=found_by,
+        )
+
+    def after_gap(self) -> TrackerState:
+        """Return the state in which the path goes on from the frame that failed.
+
+        How that lies to the frames before it is not known.
+        """
+        assert self.failed is not None
+        return replace(
+            self,
+            reference=self.failed,
+            keyframes=(),
+            part=self.failed.count,
+            memory=None,
         )
 
     def without_velocity(self) -> TrackerState:
@@ -209,6 +225,7 @@ class TrackerState:
             reference=reference,
             keyframes=tuple(each.moved(T_new_old) for each in self.keyframes),
             places=tuple(each.moved(T_new_old) for each in self.places),
+            failed=None if self.failed is None else self.failed.moved(T_new_old),
             memory=None if self.memory is None else self.memory.moved(T_new_old),
             world=None if self.world is None else self.world.moved(T_new_old),
             sensors=sensors,
@@ -230,16 +247,20 @@ class TrackerState:
                 T_world_cam=rescaled_about(keyframe.T_world_cam, here, factor),
             )
 
-        memory = self.memory
-        if memory is not None:
-            memory = replace(memory, keyframe=rescaled(memory.keyframe))
+        def recalled(memory: Memory | None) -> Memory | None:
+            if memory is None:
+                return None
+            return replace(memory, keyframe=rescaled(memory.keyframe))
+
         return replace(
             self,
             reference=rescaled(self.known_reference),
             motion_model=model,
             keyframes=tuple(map(rescaled, self.keyframes)),
             places=tuple(map(rescaled, self.places)),
-            memory=memory,
+            failed=None if self.failed is None else rescaled(self.failed),
+            memory=recalled(self.memory),
+            world=recalled(self.world),
         )
 
 

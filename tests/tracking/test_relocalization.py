@@ -43,6 +43,26 @@ def keyframe(frame: hvo.Frame, T: np.ndarray, count: int) -> Keyframe:
     return Keyframe(frame, T, count, count, np.zeros((6, 6)))
 
 
+@pytest.mark.parametrize("seed", [12, 15, 17])
+def test_a_step_that_is_too_wide_costs_one_frame(frames, seed: int) -> None:
+    """The path goes on from where the camera was taken, and only that step is unknown."""
+    elsewhere = slow_scene("static", seed, 6, SIZE)
+    vo = hvo.Odometry()
+    for k, frame in enumerate(frames[:4]):
+        assert vo.track(replace(frame, index=k)).ok
+    steps = [
+        vo.track(replace(elsewhere.render(k), index=4 + k, timestamp=(4 + k) / 30))
+        for k in range(4)
+    ]
+    assert not steps[0].usable
+    assert [step.ok for step in steps[1:]] == [True, True, True]
+    assert steps[1].prev_index == 4
+    T = elsewhere.T_world_cam
+    true = np.linalg.inv(T[3]) @ T[0]
+    got = np.linalg.inv(steps[3].T_world_cam) @ steps[0].T_world_cam
+    np.testing.assert_allclose(got, true, atol=0.02)
+
+
 def test_the_path_goes_on_where_it_was_after_the_lens_was_covered(scene, frames):
     rng = np.random.default_rng(0)
     vo = hvo.Odometry()
