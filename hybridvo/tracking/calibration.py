@@ -112,6 +112,11 @@ GYRO_BIAS_STD = 0.1
 GYRO_BIAS_WALK = 2e-4
 """By how much that bias walks, rad/s in the root of a second: ten times what ``sensor.yaml``
 of EuRoC states, for cheaper sensors that warm up."""
+GYRO_MIN_COMPARED = 20
+"""Sure steps after which a gyroscope may be found to be none of this camera's. By hand."""
+GYRO_MAX_MISFIT = 20.0
+"""Mean squared distance between its turns and those of the images, over so many steps, from which
+it is: three where both state rightly how much they err, 0.1 on EuRoC. By hand."""
 MIN_OF_IMAGES = 0.5
 """Fraction of the information on a rotation that must come from the images for it to show the
 bias: the rest is the gyroscope's own."""

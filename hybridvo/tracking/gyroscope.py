@@ -10,10 +10,13 @@ from scipy.spatial.transform import Rotation
 from hybridvo.core.errors import InputError
 from hybridvo.core.imu import ImuSamples, with_earlier
 from hybridvo.core.results import MotionPrior, Step, Term
+from hybridvo.solver.calibration import PRIOR_FREEDOM
 from hybridvo.tracking.calibration import (
     GYRO_BIAS_STD,
     GYRO_BIAS_WALK,
     GYRO_HOLD_S,
+    GYRO_MAX_MISFIT,
+    GYRO_MIN_COMPARED,
     GYRO_NOISE_DENSITY,
     MIN_OF_IMAGES,
 )
@@ -36,6 +39,14 @@ class Gyroscope:
     covariance: np.ndarray = field(
         default_factory=lambda: GYRO_BIAS_STD**2 * np.eye(3)
     )
+    # steps that were compared, and the mean of their squared distances, in units of what both err
+    compared: int = 0
+    misfit: float = 0.0
+
+    @property
+    def contradicts_images(self) -> bool:
+        """Whether it turns otherwise than the images, again and again: it is then left out."""
+        return self.compared >= GYRO_MIN_COMPARED and self.misfit > GYRO_MAX_MISFIT
 
     def after(self, samples: ImuSamples) -> Gyroscope:
         """Return the gyroscope after further samples; it starts anew where their clock does."""
@@ -81,7 +92,7 @@ class Gyroscope:
             The rotation, as uncertain as noise and bias make it, and an unknown translation.
         """
         turned = self._integrated(start, end)
-        if turned is None:
+        if turned is None or self.contradicts_images:
             return None
         covariance = turned.covariance.copy()
         covariance[3:, 3:] += (end - start) ** 2 * self._in_camera(self.covariance)
@@ -121,11 +132,18 @@ class Gyroscope:
         noise = of_images / duration**2 + GYRO_NOISE_DENSITY**2 / duration * np.eye(
             3
         )
-        gain = walked @ np.linalg.inv(walked + noise)
+        squared = float(error @ np.linalg.solve(walked + noise, error))
+        # Student's kernel: a step that is wrong says little
+        factor = (PRIOR_FREEDOM + 3) / (PRIOR_FREEDOM + squared)
+        gain = walked @ np.linalg.inv(walked + noise / min(factor, 1.0))
+        compared = self.compared + 1
+        change = min(squared, 3 * GYRO_MAX_MISFIT) - self.misfit
         return replace(
             self,
             bias=self.bias + gain @ error,
             covariance=(np.eye(3) - gain) @ walked,
+            compared=compared,
+            misfit=self.misfit + change / min(compared, GYRO_MIN_COMPARED),
         )
 
     @property

@@ -285,7 +285,13 @@ def _gyroscope_after(
     starts = before.starts
     start = None if step.prev_index is None else starts.get(step.prev_index)
     if start is not None:
+        was_false = gyroscope.contradicts_images
         gyroscope = gyroscope.corrected(step, start.timestamp, step.timestamp)
+        if gyroscope.contradicts_images and not was_false:
+            _logger.warning(
+                "Odometry.track: the gyroscope turns otherwise than the images, and is left out "
+                "from here on; check its axes (R_cam_imu), signs, unit (rad/s) and clock"
+            )
     needed = [frame.timestamp for frame in after.nearest_starts]
     return gyroscope.since(min(needed)) if needed else gyroscope
 

@@ -62,6 +62,37 @@ def test_the_bias_is_learned_from_steps() -> None:
     assert len(gyroscope.samples) < 40
 
 
+SWAPPED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("fault", "is_false"),
+    [
+        (np.eye(3), False),
+        (SWAPPED, True),
+        (np.diag([1.0, -1, 1]), True),
+        (np.rad2deg(1) * np.eye(3), True),
+    ],
+)
+def test_a_gyroscope_that_contradicts_the_images_is_left_out(
+    fault: np.ndarray, is_false: bool
+) -> None:
+    gyroscope = Gyroscope()
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        turn = rng.normal(0, 0.02, 3)
+        start = k * FRAME_S
+        gyroscope = gyroscope.after(samples_between(start, fault @ turn))
+        step = step_of(turn, start + FRAME_S)
+        if k == 10:
+            # one step is wrong, and sure
+            step = step_of(turn + 0.5, start + FRAME_S)
+        gyroscope = gyroscope.corrected(step, start, start + FRAME_S)
+    assert gyroscope.contradicts_images == is_false
+    measured = gyroscope.measured(39 * FRAME_S, 40 * FRAME_S)
+    assert (measured is None) == is_false
+
+
 def test_what_the_gyroscope_added_to_a_step_teaches_nothing() -> None:
     """The bias is that of the images alone, whether or not the step holds its rotation."""
     gyroscope = Gyroscope().after(samples_between(0, np.zeros(3)))
