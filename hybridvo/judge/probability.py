@@ -91,10 +91,10 @@ def direct_probability(evidence: DirectEvidence) -> float:
     >>> from hybridvo.solver.aligned_points import direct_evidence
     >>> turning_camera = direct_evidence(0.0002, 0.05, 1.0, 0.1)
     >>> round(direct_probability(turning_camera), 2)
-    0.97
+    0.98
     >>> between_two = direct_evidence(0.0005, 0.004, 2.7, 0.03)
     >>> round(direct_probability(between_two), 2)
-    0.03
+    0.02
     """
     is_of_scene = logistic([evidence.log_unexplained], DIRECT_OF_SCENE)
     return logistic(evidence, DIRECT_EXACT) * is_of_scene
