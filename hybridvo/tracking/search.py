@@ -238,9 +238,20 @@ class Pairs:
         near = self.arrival.near
         if near is not None:
             near = near @ self._T_ref_start(start)
+        if self._asks_for_a_look:
+            direct = replace(context.options.direct, mode="off")
+            options = replace(context.options, direct=direct)
+            context = replace(context, options=options)
         return context.evidence(
             pair, expected, remembered=self._remembered(start), near=near
         )
+
+    @property
+    def _asks_for_a_look(self) -> bool:
+        """Whether nothing is known of the scene: images alone are sure of what fills the view."""
+        memory = self.state.memory
+        is_known = memory is not None and memory.belief.is_ready
+        return self.setup.remembers and not is_known
 
     def _remembered(self, start: Keyframe) -> Remembered | None:
         """What is remembered, for the view of a start; None: nothing."""

@@ -91,7 +91,7 @@ def test_a_rendered_camera_that_stands_repeats_rightly(walk) -> None:
     frame = walk[0][0]
     steps = tracked([frame] * 4, walk[1])
     assert all(step.ok for step in steps)
-    np.testing.assert_allclose(steps[-1].T_world_cam, walk[1][0], atol=1e-6)
+    np.testing.assert_allclose(steps[-1].T_world_cam, walk[1][0], atol=1e-5)
 
 
 def test_noise_in_the_image_alone_is_no_repeated_depth(walk) -> None:

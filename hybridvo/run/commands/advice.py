@@ -16,8 +16,8 @@ USE = {
 ADVICE = {
     Reason.NONE: "no reason is stated",
     Reason.AMBIGUOUS_MOTION: (
-        "another motion fits nearly as well; mask what moves (--mask), "
-        "or check depth and camera (hybridvo doctor)"
+        "another motion fits nearly as well; mask what moves (--mask). Where nothing does, look "
+        "for blur, a rolling shutter, or depth of another moment (hybridvo doctor)"
     ),
     Reason.CONTRADICTED: (
         "images or depth maps lead elsewhere; check that flow, images and depth are of the same "
