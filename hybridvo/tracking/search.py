@@ -251,7 +251,8 @@ class Pairs:
         """Whether nothing is known of the scene: images alone are sure of what fills the view."""
         memory = self.state.memory
         is_known = memory is not None and memory.belief.is_ready
-        return self.setup.remembers and not is_known
+        is_free = self.setup.options.direct.mode == "auto"
+        return is_free and self.setup.remembers and not is_known
 
     def _remembered(self, start: Keyframe) -> Remembered | None:
         """What is remembered, for the view of a start; None: nothing."""

@@ -32,7 +32,11 @@ from hybridvo.evidence.one_time import (
 from hybridvo.flow.providers import has_texture
 from hybridvo.judge.verdict import believed
 from hybridvo.solver.depth_alone import DepthEvidence
-from hybridvo.tracking.calibration import HARDLY_HIDDEN, MOSTLY_HIDDEN
+from hybridvo.tracking.calibration import (
+    HARDLY_HIDDEN,
+    MAX_HIDDEN_FRAMES,
+    MOSTLY_HIDDEN,
+)
 from hybridvo.tracking.depth_scale import ScaleFilter, divided, measured_scale
 from hybridvo.tracking.hidden_world import hidden_by
 from hybridvo.tracking.keyframes import (
@@ -121,7 +125,9 @@ def keep(
         found.covariance,
         found.ok,
     )
-    after = replace(known_path(state, estimate), hidden=0)
+    # waited for in vain: it may have been no scene
+    world = None if state.hidden >= MAX_HIDDEN_FRAMES else state.world
+    after = replace(known_path(state, estimate), hidden=0, world=world)
     is_sure = leads and found.ok and setup.spans_frames
     if is_sure and frame.rgb is not None and has_enough_depth(frame):
         after = replace(
@@ -290,8 +296,10 @@ def _behind_something(
     """
     frame = arrival.frame
     T_world_cam, motion = fallback(setup, state, estimate.motion, arrival.given)
-    how = "is held" if arrival.given is None else "is as given"
-    if setup.options.track.on_failure == "constant_velocity":
+    how = "is held"
+    if arrival.given is not None:
+        how = "is as given"
+    elif setup.options.track.on_failure == "constant_velocity":
         how = "goes on with constant velocity"
     text = f"something nearer hides what was seen to stand; the path {how}"
     motion = believed(
@@ -333,6 +341,8 @@ def _held(
         state,
         motion_model=replace(model, failed=model.failed + 1),
         part=state.count if is_cut else state.part,
+        # how it lies to the frames from here on is not known
+        world=None if is_cut else state.world,
         keyframes=estimate.keyframes,
         memory=None if state.memory is None else faded(state.memory),
     )

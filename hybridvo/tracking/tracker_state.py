@@ -178,6 +178,7 @@ class TrackerState:
             keyframes=(),
             part=self.failed.count,
             memory=None,
+            world=None,
         )
 
     def without_velocity(self) -> TrackerState:
