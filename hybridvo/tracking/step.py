@@ -341,8 +341,6 @@ def _held(
         state,
         motion_model=replace(model, failed=model.failed + 1),
         part=state.count if is_cut else state.part,
-        # how it lies to the frames from here on is not known
-        world=None if is_cut else state.world,
         keyframes=estimate.keyframes,
         memory=None if state.memory is None else faded(state.memory),
     )

@@ -178,7 +178,6 @@ class TrackerState:
             keyframes=(),
             part=self.failed.count,
             memory=None,
-            world=None,
         )
 
     def without_velocity(self) -> TrackerState:

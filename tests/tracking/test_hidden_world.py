@@ -116,12 +116,3 @@ def test_a_hidden_scene_is_waited_for_until_a_motion_is_sure() -> None:
     assert hidden(doubted, replace(state, hidden=MAX_HIDDEN_FRAMES)) == 0
     assert hidden(doubted, replace(state, hidden=0)) == 0
     assert hidden(doubted, replace(state, world=None)) == 0
-
-
-def test_after_a_gap_the_scene_before_it_says_nothing() -> None:
-    rng = np.random.default_rng(0)
-    world = memory_of(view(0, 0, rng))
-    state = TrackerState(
-        reference=world.keyframe, world=world, failed=world.keyframe
-    )
-    assert state.after_gap().world is None
