@@ -6,17 +6,26 @@ camera's motion what stands is seen again, or out of view, or hidden by what sta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
+from hybridvo import pipeline
 from hybridvo.core.calibration import KNOWN_LOG_ODDS
-from hybridvo.core.geometry import invert, transform_points
-from hybridvo.core.types import Frame
+from hybridvo.core.geometry import invert, squared_distance, transform_points
+from hybridvo.core.types import Frame, FramePair
 from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.points import points_of
 from hybridvo.solver.visibility import visibility
-from hybridvo.tracking.calibration import MAX_HIDDEN_FRAMES, MIN_WORLD_IN_VIEW
+from hybridvo.tracking.calibration import (
+    APART,
+    MAX_HIDDEN_FRAMES,
+    MIN_WORLD_IN_VIEW,
+)
+from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
-from hybridvo.tracking.search import Estimate
+from hybridvo.tracking.search import Arrival, Estimate, Setup
 from hybridvo.tracking.tracker_state import TrackerState
 
 
@@ -39,6 +48,66 @@ def hidden_by(state: TrackerState, frame: Frame, estimate: Estimate) -> float:
     if not (estimate.motion.usable and frame.is_rgbd):
         return 0.0
     return hidden_fraction(world, frame, estimate.T_world_cam)
+
+
+def by_scene_behind(
+    setup: Setup, state: TrackerState, arrival: Arrival, found: Estimate
+) -> Estimate | None:
+    """Return the motion by a scene that comes out from behind what was taken for it.
+
+    Args:
+        setup: of the tracker.
+        state: of the tracker before the frame.
+        arrival: the frame.
+        found: the motion by what was taken for the scene.
+
+    Returns:
+        The motion that a look at the pair alone is sure of; None where that is the one found, or
+        nothing hides the scene.
+    """
+    if arrival.flow is not None or not setup.remembers:
+        return None
+    if not found.motion.usable or not hides_what_moves(state.memory, state.places):
+        return None
+    start = min((*found.keyframes, found.start), key=lambda each: each.count)
+    options = setup.context.options
+    looking = replace(options, direct=replace(options.direct, mode="off"))
+    context = replace(setup.context, options=looking)
+    pair = FramePair(start.frame, arrival.frame, None)
+    motion = pipeline.run_method(
+        context.evidence(pair), setup.method, context, arrival.deadline
+    )
+    if not motion.ok:
+        return None
+    T_found = invert(start.T_world_cam) @ found.T_world_cam
+    covariance = motion.covariance + found.motion.covariance
+    apart = squared_distance(motion.T_curr_prev, invert(T_found), covariance)
+    if apart < APART:
+        return None
+    return Estimate(start, motion, (start,))
+
+
+def hides_what_moves(memory: Memory | None, places: Sequence[Keyframe]) -> bool:
+    """Return whether what seems to move was hidden at first by what was taken for the scene.
+
+    A lorry that filled the first view was taken for the scene. When it drives off, the scene comes
+    out from behind it, and seems to move.
+
+    Args:
+        memory: of a tracker.
+        places: of the tracker, the first one first.
+    """
+    if memory is None or not places or not memory.belief.something_moves:
+        return False
+    known = memory.keyframe
+    first = places[0]
+    points = points_of(known.frame)
+    moves = memory.belief.log_odds[points.cells] < -KNOWN_LOG_ODDS
+    T_first_known = invert(first.T_world_cam) @ known.T_world_cam
+    there = visibility(
+        transform_points(T_first_known, points.xyz[moves]), first.frame, 0.0
+    )
+    return int(np.sum(there.is_hidden)) > 0.5 * int(np.sum(there.inside))
 
 
 def hidden_fraction(world: Memory, frame: Frame, T_world_cam: np.ndarray) -> float:

@@ -38,7 +38,7 @@ from hybridvo.tracking.calibration import (
     MOSTLY_HIDDEN,
 )
 from hybridvo.tracking.depth_scale import ScaleFilter, divided, measured_scale
-from hybridvo.tracking.hidden_world import hidden_by
+from hybridvo.tracking.hidden_world import by_scene_behind, hidden_by
 from hybridvo.tracking.keyframes import (
     Keyframe,
     between_frames,
@@ -78,7 +78,12 @@ def follow(
         return followed
     if setup.has_own_scale(arrival.frame):
         return _in_common_scale(setup, state, arrival)
-    return keep(setup, state, arrival, find(setup, state, arrival))
+    estimate = find(setup, state, arrival)
+    behind = by_scene_behind(setup, state, arrival, estimate)
+    if behind is not None:
+        state = state.of_another_scene(behind.start)
+        estimate = behind
+    return keep(setup, state, arrival, estimate)
 
 
 def keep(

@@ -180,6 +180,22 @@ class TrackerState:
             memory=None,
         )
 
+    def of_another_scene(self, start: Keyframe) -> TrackerState:
+        """Return the state in which what was taken for the scene is forgotten.
+
+        Args:
+            start: the frame from which the scene is followed.
+        """
+        return replace(
+            self,
+            reference=start,
+            keyframes=(),
+            places=(),
+            memory=None,
+            world=None,
+            hidden=0,
+        )
+
     def without_velocity(self) -> TrackerState:
         """Return the state that expects nothing of the next motion."""
         model = replace(self.motion_model, T_last=None)

@@ -13,7 +13,11 @@ from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import Reason, RelativePose, Status, Term
 from hybridvo.solver.points import grid_index
 from hybridvo.tracking.calibration import MAX_HIDDEN_FRAMES
-from hybridvo.tracking.hidden_world import hidden_by, hidden_fraction
+from hybridvo.tracking.hidden_world import (
+    hidden_by,
+    hidden_fraction,
+    hides_what_moves,
+)
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.search import Estimate
@@ -32,13 +36,24 @@ def texture(seed: int, width: int) -> np.ndarray:
     return np.repeat(np.kron(coarse, np.ones((4, 4)))[..., None], 3, axis=2)
 
 
-def view(first: int, last: int, rng: np.random.Generator) -> hvo.Frame:
+def rock_face() -> np.ndarray:
+    """(120, 160) depth, metres."""
+    v, u = np.indices(SIZE)
+    return WALL_M + 1.5 * np.sin(u / 23.0) + 0.8 * np.cos(v / 17.0)
+
+
+def view(
+    first: int,
+    last: int,
+    rng: np.random.Generator,
+    wall: float | np.ndarray = WALL_M,
+) -> hvo.Frame:
     """A wall, before which a lorry stands between two columns, with the noise of a camera.
 
     Its texture moves with its first column.
     """
     rgb = texture(1, SIZE[1])
-    depth = np.full(SIZE, WALL_M)
+    depth = np.full(SIZE, wall)
     left, right = max(first, 0), min(last, SIZE[1])
     if right > left:
         rgb[:, left:right] = texture(2, 400)[:, left - first : right - first]
@@ -67,6 +82,44 @@ def test_a_lorry_that_passes_moves_nothing() -> None:
         assert np.linalg.norm(step.T_world_cam[:3, 3]) < 0.01
     assert steps[-1].ok
     assert Reason.HIDDEN_WORLD not in reasons[:8] + reasons[-3:]
+
+
+def leaving_lorry() -> list[hvo.Frame]:
+    """A camera that stands sees nothing but a lorry, which then drives off."""
+    rng = np.random.default_rng(0)
+    starts = range(-16, 100, 3)
+    return [view(start, start + 400, rng, rock_face()) for start in starts]
+
+
+@pytest.mark.slow
+def test_the_scene_that_a_lorry_leaves_is_found() -> None:
+    tracker = hvo.Odometry()
+    steps = [tracker.track(frame) for frame in leaving_lorry()]
+    lengths = np.array([np.linalg.norm(each.T_curr_prev[:3, 3]) for each in steps])
+    # nothing but the lorry is seen
+    assert np.all(lengths[1:5] > 0.01)
+    # half of the view is what it hid
+    assert all(each.ok for each in steps[32:])
+    assert np.all(lengths[32:] < 0.005)
+
+
+def test_what_moves_was_hidden_at_first_or_was_not() -> None:
+    rng = np.random.default_rng(0)
+    memory = memory_of(view(-240, 80, rng))
+    log_odds = memory.belief.log_odds.copy()
+    middle = log_odds.shape[1] // 2
+    log_odds[:, middle:] = -3.0
+    wall_moves = replace(memory, belief=Belief(log_odds, certainty=7.0))
+    log_odds = -log_odds
+    lorry_moves = replace(memory, belief=Belief(log_odds, certainty=7.0))
+    everywhere = [memory_of(view(-240, 160, rng)).keyframe]
+    nowhere = [memory_of(view(0, 0, rng)).keyframe]
+    assert hides_what_moves(wall_moves, everywhere)
+    assert not hides_what_moves(lorry_moves, everywhere)
+    assert not hides_what_moves(wall_moves, nowhere)
+    assert not hides_what_moves(memory, everywhere)
+    assert not hides_what_moves(None, everywhere)
+    assert not hides_what_moves(wall_moves, [])
 
 
 def memory_of(frame: hvo.Frame, log_odds: float = 3.0) -> Memory:
