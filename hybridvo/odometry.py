@@ -2,14 +2,39 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
 
 from hybridvo.core.checks import check_kind
-from hybridvo.core.results import Step
+from hybridvo.core.geometry import invert
+from hybridvo.core.imu import ImuSamples
+from hybridvo.core.results import MotionPrior, Reason, Step
+from hybridvo.core.types import Frame
+from hybridvo.core.unchecked import changed
+from hybridvo.evidence.one_time import states_times
+from hybridvo.flow.providers import FlowField
 from hybridvo.objects.followed import Things, after_step
 from hybridvo.objects.motions import GridView
+from hybridvo.tracking.readout import ReadoutFinder, Taken, surely_ms
 from hybridvo.tracking.tracker import Tracker
 from hybridvo.tracking.tracker_state import TrackerState
+
+PAIRS_OF_READOUT = 45
+"""Pairs that show a readout while a tracker runs: those before it was known show too little."""
+
+
+class _Given(NamedTuple):
+    """A frame whose step was given, and what it takes to find that once more."""
+
+    before: TrackerState
+    things: Things
+    frame: Frame
+    prior: MotionPrior | None
+    imu: ImuSamples | None
+    is_stated: bool  # the times of its pixels, by its camera
 
 
 class Odometry(Tracker):
@@ -44,6 +69,8 @@ class Odometry(Tracker):
         """Forget everything: the next frame is the first one, at the identity."""
         super().reset()
         self.things = Things()
+        self._given_once: _Given | None = None
+        self._readout = ReadoutFinder(PAIRS_OF_READOUT)
 
     def resume(self, state: TrackerState, things: Things | None = None) -> None:
         """Go on where another tracker stopped.
@@ -55,9 +82,94 @@ class Odometry(Tracker):
         Raises:
             InputError: for a value of another type.
         """
-        super().resume(state)
         check_kind("Odometry.resume: things", things, Things, type(None))
+        super().resume(state)
+        self._given_once = None
         self.things = things or Things()
+
+    def set_pose(self, T_world_cam: np.ndarray) -> None:
+        """Set the pose of the camera; see :meth:`Tracker.set_pose`."""
+        T_last_world = invert(self.state.T_world_last)
+        super().set_pose(T_world_cam)
+        once = self._given_once
+        if once is not None:
+            T_new_old = self.state.T_world_last @ T_last_world
+            before = once.before.moved(T_new_old @ once.before.T_world_last)
+            self._given_once = once._replace(before=before)
+
+    def track(
+        self,
+        frame: Frame,
+        flow: FlowField | np.ndarray | None = None,
+        prior: MotionPrior | None = None,
+        imu: ImuSamples | None = None,
+        following: Frame | None = None,
+    ) -> Step:
+        """Track the next frame; see :meth:`Tracker.track`.
+
+        With ``track.lag`` the step of the frame before is given once more, as ``corrected``.
+        """
+        check_kind("Odometry.track", frame, Frame)
+        if not self.options.track.lag or flow is not None or following is not None:
+            self._given_once = None
+            return super().track(frame, flow, prior, imu, following)
+        is_stated = states_times(frame.camera)
+        frame = deepcopy(self._with_readout(frame))
+        corrected = self._corrected(frame)
+        before = self.state
+        things = self.things
+        step = super().track(frame, None, prior, imu)
+        frame = changed(frame, index=step.index)
+        if states_times(frame.camera) and before.reference is not None:
+            self._given_once = _Given(before, things, frame, prior, imu, is_stated)
+        elif not is_stated:
+            self._take_note(0.0, frame, step)
+        return replace(step, corrected=corrected)
+
+    def skip(
+        self,
+        index: int,
+        timestamp: float,
+        message: str = "",
+        reason: Reason = Reason.MISSING_FRAME,
+        prior: MotionPrior | None = None,
+    ) -> Step:
+        """Pass over a frame that could not be read; see :meth:`Tracker.skip`."""
+        self._given_once = None
+        return super().skip(index, timestamp, message, reason, prior)
+
+    @property
+    def readout_ms(self) -> float:
+        """How long the rows of an image take, ms, as ``track.lag`` finds it; 0: not known."""
+        return surely_ms(self._readout.mean())
+
+    def _with_readout(self, frame: Frame) -> Frame:
+        """A frame whose camera states the readout that was found, unless it states its own."""
+        if states_times(frame.camera) or not self.readout_ms:
+            return frame
+        camera = replace(frame.camera, readout_ms=self.readout_ms)
+        return changed(frame, camera=camera)
+
+    def _corrected(self, following: Frame) -> Step | None:
+        """Track the frame before once more, now that it is known what follows."""
+        once = self._given_once
+        if once is None:
+            return None
+        self._given_once = None
+        self.state = once.before
+        self.things = once.things
+        step = super().track(once.frame, None, once.prior, once.imu, following)
+        if not once.is_stated:
+            self._take_note(once.frame.camera.readout_ms, once.frame, step)
+        return step
+
+    def _take_note(self, readout_ms: float, frame: Frame, step: Step) -> None:
+        """Learn what a frame shows of the readout, with its last step."""
+        last = self.state.frame
+        if last is not None and last.index == step.index:
+            # as it was tracked
+            frame = last
+        self._readout.add(Taken(frame, step, is_old=False, readout_ms=readout_ms))
 
     def _finished(
         self, before: TrackerState, after: TrackerState, step: Step

@@ -521,6 +521,8 @@ class Step:
         gravity: which way is down, if samples of an accelerometer were handed in; else None.
         measured: the motion from a keyframe by which this frame was measured, if ``motion``
             follows from that and from the pose of frame ``prev_index``; else None.
+        corrected: the step before, once more, with ``track.lag``; the pose of this one goes on
+            from there. None where that step stays as it was.
 
     >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
     >>> step.ok, step.T_prev_curr.shape
@@ -537,6 +539,7 @@ class Step:
     objects: tuple[MovingObject, ...] = ()
     gravity: Gravity | None = None
     measured: Edge | None = None
+    corrected: Step | None = None
 
     @property
     def edge(self) -> Edge | None:

@@ -47,10 +47,10 @@ def is_of_one_time(pair: FramePair) -> bool:
     """Whether the cameras of a pair state no times, or the time between its frames is unknown."""
     between_s = pair.curr.timestamp - pair.prev.timestamp
     cameras = (pair.prev.camera, pair.curr.camera)
-    return between_s <= 0 or not any(_states_times(each) for each in cameras)
+    return between_s <= 0 or not any(states_times(each) for each in cameras)
 
 
-def _states_times(camera: Camera) -> bool:
+def states_times(camera: Camera) -> bool:
     """Whether the pixels of a camera's frames were measured at several times."""
     return camera.readout_ms != 0 or camera.depth_lag_ms != 0
 
@@ -123,7 +123,7 @@ def at_image_time(frame: Frame, velocity: np.ndarray) -> Frame:
         camera then states; the same frame where that is so already.
     """
     camera = frame.camera
-    if not _states_times(camera):
+    if not states_times(camera):
         return frame
     of_image, of_depth = _readings(frame, velocity)
     return replace(

@@ -9,7 +9,6 @@ velocity. With the velocities, images also show much better how long the rows ta
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral
@@ -19,25 +18,19 @@ import numpy as np
 
 from hybridvo.core.checks import check_kind
 from hybridvo.core.errors import InputError
-from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Step
 from hybridvo.core.types import Camera, Frame
 from hybridvo.evidence.one_time import at_image_time
-from hybridvo.tracking.calibration import MAX_READOUT_STD_MS, MIN_STATIC_SHARE
-from hybridvo.tracking.camera_drift import (
-    CAMERA_SIGMAS,
-    MAX_EVEN_MS,
-    MIN_CAMERA_STEPS,
-    Bend,
-    Mean,
-    bends_of,
-    robust_mean,
+from hybridvo.tracking.camera_drift import Mean
+from hybridvo.tracking.readout import (
+    ReadoutFinder,
+    Taken,
+    is_known,
+    surely_ms,
+    velocity_over,
 )
 from hybridvo.tracking.repeated import repeat_of
 from hybridvo.tracking.tracker import Tracker
-
-# frames whose poses give the velocities of the two in the middle
-NEIGHBOURS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +55,12 @@ class PixelTimes:
     @property
     def readout_is_known(self) -> bool:
         """Whether the images show how long the rows take, or that they take no time."""
-        return self.readout is not None and self.readout.std < MAX_READOUT_STD_MS
+        return is_known(self.readout)
 
     @property
     def readout_ms(self) -> float:
         """The readout where the images surely show one; else 0."""
-        if self.readout is None or not self.readout_is_known:
-            return 0.0
-        rolls = self.readout.error > CAMERA_SIGMAS * self.readout.std
-        return self.readout.error if rolls else 0.0
+        return surely_ms(self.readout)
 
     def camera(self, camera: Camera) -> Camera:
         """Return a camera that states the readout, unless it states one already."""
@@ -218,14 +208,6 @@ def _new_tracker(make_tracker: Callable[[], Tracker]) -> Tracker:
     return tracker
 
 
-class _Taken(NamedTuple):
-    """A frame as it was tracked, and its step."""
-
-    frame: Frame
-    step: Step
-    is_old: bool  # it is the frame before, handed out again
-
-
 class TimesFinder:
     """What a pass shows of the times of a recording's pixels; frames are handed in one by one.
 
@@ -236,8 +218,7 @@ class TimesFinder:
     def __init__(self, known: PixelTimes | None = None) -> None:
         self.known = known or PixelTimes()
         self._velocities: dict[int, np.ndarray] = {}
-        self._bends: list[Bend] = []
-        self._window: deque[_Taken] = deque(maxlen=NEIGHBOURS)
+        self._readout = ReadoutFinder()
         self._last: Frame | None = None
         # a tracker knows what a camera handed out again by its bytes, which must stay as they are
         self._as_taken: set[int] = set()
@@ -256,16 +237,15 @@ class TimesFinder:
         if self._last is not None and any(repeat):
             self._as_taken |= {self._last.index, frame.index}
         self._last = frame
-        self._window.append(_Taken(frame, step, repeat.entire))
+        taken = Taken(frame, step, repeat.entire)
+        self._readout.add(taken, may_show=not self._readout_is_stated)
         self._learn_velocities()
-        if len(self._window) == NEIGHBOURS:
-            self._learn_readout(*self._window)
 
     def found(self) -> PixelTimes:
         """Return what the frames so far show."""
         readout = self.known.readout
-        if len(self._bends) >= MIN_CAMERA_STEPS:
-            left = robust_mean(self._bends)
+        left = self._readout.mean()
+        if left is not None:
             readout = left._replace(error=self.known.readout_ms + left.error)
         velocities = {
             index: velocity
@@ -283,69 +263,12 @@ class TimesFinder:
         The one before has a neighbour on either side now. Where either is of no use, the other
         one tells.
         """
-        taken = list(self._window)
+        taken = list(self._readout.window)
         if len(taken) == 1:
             return
         prev, last = taken[-2:]
         pair = taken[-2:]
         for at, around in ((last, pair), (prev, pair), (prev, taken[-3:])):
-            velocity = _velocity(around)
+            velocity = velocity_over(around)
             if velocity is not None:
                 self._velocities[at.frame.index] = velocity
-
-    def _learn_readout(
-        self, before: _Taken, prev: _Taken, curr: _Taken, after: _Taken
-    ) -> None:
-        """Learn what the two frames in the middle show of the readout."""
-        step = curr.step
-        is_neighbour = step.prev_index == prev.frame.index
-        is_static = step.ok and step.motion.inlier_ratio > MIN_STATIC_SHARE
-        if self._readout_is_stated or not (is_neighbour and is_static):
-            return
-        at_prev = _velocity([before, prev, curr])
-        at_curr = _velocity([prev, curr, after])
-        if at_prev is None or at_curr is None:
-            return
-        everywhere = np.ones(prev.frame.camera.shape, np.float32)
-        motion = step.motion.replace(weights=everywhere)
-        bends = bends_of(prev.frame, curr.frame, motion, (at_prev, at_curr))
-        if bends is not None and bends.readout is not None:
-            self._bends.append(bends.readout)
-
-
-def _velocity(taken: Sequence[_Taken]) -> np.ndarray | None:
-    """The mean velocity (6,) from the first of some successive frames to the last.
-
-    It is None over an unknown or long time, and where the motion between the two is not known.
-    """
-    first = taken[0]
-    last = taken[-1]
-    between_s = last.frame.timestamp - first.frame.timestamp
-    if not 0 < 1000 * between_s <= 2 * MAX_EVEN_MS:
-        return None
-    if not _are_joined(taken):
-        return None
-    T_last_first = invert(last.step.T_world_cam) @ first.step.T_world_cam
-    return se3_log(T_last_first) / between_s
-
-
-def _are_joined(taken: Sequence[_Taken]) -> bool:
-    """Whether motions that were found join the first of some successive frames to the last.
-
-    The pose of a frame whose motion failed is a guess: only a motion that starts there tells of
-    it. An old frame was not taken when it is stamped.
-    """
-    first = taken[0]
-    last = taken[-1]
-    if first.is_old or last.is_old:
-        return False
-    later = {each.frame.index: each.step for each in taken[1:]}
-    start: int | None = last.frame.index
-    while start in later:
-        step = later.pop(start)
-        if not step.usable:
-            return False
-        start = step.prev_index
-    if start is None:
-        return False
-    return start == first.frame.index or first.step.usable

@@ -92,6 +92,7 @@ class Arrival(NamedTuple):
     # (4, 4) motion from the reference as the most reduced images show it
     near: np.ndarray | None = None
     repeat: Repeat = Repeat()  # which parts of it are those of the frame before
+    following: Frame | None = None  # the frame after it, where that is known
 
     @property
     def without_depth(self) -> Arrival:

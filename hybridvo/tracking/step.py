@@ -24,19 +24,23 @@ from hybridvo.core.results import (
     Term,
 )
 from hybridvo.core.types import Frame, FramePair
+from hybridvo.core.unchecked import changed
 from hybridvo.evidence.one_time import (
+    at_image_time,
     is_of_one_time,
     pair_at_image_times,
     rough_motion,
 )
 from hybridvo.flow.providers import has_texture
 from hybridvo.judge.verdict import believed
+from hybridvo.solver.coarse_images import follow_roughly
 from hybridvo.solver.depth_alone import DepthEvidence
 from hybridvo.tracking.calibration import (
     HARDLY_HIDDEN,
     MAX_HIDDEN_FRAMES,
     MOSTLY_HIDDEN,
 )
+from hybridvo.tracking.camera_drift import MAX_EVEN_MS
 from hybridvo.tracking.depth_scale import ScaleFilter, divided, measured_scale
 from hybridvo.tracking.hidden_world import by_scene_behind, hidden_by
 from hybridvo.tracking.keyframes import (
@@ -48,7 +52,11 @@ from hybridvo.tracking.keyframes import (
 from hybridvo.tracking.memory import Memory, faded, memory_after
 from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.relocalization import with_place
-from hybridvo.tracking.repeated import is_as_good_as_new, motion_without_image
+from hybridvo.tracking.repeated import (
+    is_as_good_as_new,
+    motion_without_image,
+    repeat_of,
+)
 from hybridvo.tracking.search import Arrival, Estimate, Setup, find
 from hybridvo.tracking.tracker_state import TrackerState, unknown_covariance
 
@@ -420,10 +428,37 @@ def _at_one_time(
     else:
         T_near = rough_motion(taken, expected, setup.options.refine, found_in)
     in_time = pair_at_image_times(taken, T_near)
+    curr = in_time.curr
+    velocity = _velocity_between(setup, state, arrival, T_near)
+    if velocity is not None:
+        curr = at_image_time(arrival.frame, velocity)
     return (
         state.starting_with(in_time.prev),
-        arrival._replace(frame=in_time.curr, near=T_near),
+        arrival._replace(frame=curr, near=T_near),
     )
+
+
+def _velocity_between(
+    setup: Setup, state: TrackerState, arrival: Arrival, T_near: np.ndarray
+) -> np.ndarray | None:
+    """The velocity (6,) at a frame, by the frames before and after it; None: that is not known.
+
+    The motion to a frame alone tells of the time before it.
+    """
+    frame = arrival.frame
+    following = arrival.following
+    expected = state.expected()
+    if following is None or expected is None:
+        return None
+    until = following.timestamp - frame.timestamp
+    since = frame.timestamp - state.known_reference.frame.timestamp
+    is_old = arrival.repeat.colour or repeat_of(frame, following).colour
+    if is_old or not 0 < until <= MAX_EVEN_MS / 1000:
+        return None
+    next_pair = FramePair(frame, following, None)
+    as_before = changed(expected, T_curr_prev=T_near)
+    T_next = follow_roughly(next_pair, as_before, setup.options.refine)
+    return se3_log(T_next @ T_near) / (since + until)
 
 
 def _without_image(

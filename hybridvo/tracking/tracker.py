@@ -132,6 +132,7 @@ class Tracker:
         flow: FlowField | np.ndarray | None = None,
         prior: MotionPrior | None = None,
         imu: ImuSamples | None = None,
+        following: Frame | None = None,
     ) -> Step:
         """Track the next frame; the motion of the first one is the identity, with status ok.
 
@@ -145,6 +146,8 @@ class Tracker:
                 before, is what is expected. It also takes part in the motion that is found, by
                 its covariance; the bias of the sensor is learned from sure steps. If they have
                 accelerations, the step has ``gravity``.
+            following: the frame after it, where that is known. Where the camera states times of
+                its pixels (``readout_ms``, ``depth_lag_ms``), it shows the velocity at this one.
 
         Returns:
             The step, whose ``prev_index`` is the frame from which its motion starts.
@@ -156,6 +159,7 @@ class Tracker:
         if prior is not None:
             check_kind("Odometry.track: prior", prior, MotionPrior)
         check_kind("Odometry.track: imu", imu, ImuSamples, type(None))
+        check_kind("Odometry.track: following", following, Frame, type(None))
         before = self.state
         sensors = before.sensors
         gyroscope = sensors.gyroscope
@@ -174,7 +178,13 @@ class Tracker:
         if gyroscope is not None and prior is None and not breaks:
             prior = self._expected_by_gyroscope(gyroscope, frame)
         arrival = Arrival(
-            frame, flow, prior, self._deadline(), gyroscope, repeat=repeat
+            frame,
+            flow,
+            prior,
+            self._deadline(),
+            gyroscope,
+            repeat=repeat,
+            following=following,
         )
         state, step = follow(self._setup, state, arrival)
         if breaks:
