@@ -227,10 +227,10 @@ class TrackOptions:
         objects: ``off``, or ``auto``: what moves by itself is told apart, with its motion, where
             frames have images and depth.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
-        lag: 1: a step is given at once, and again one frame later, when it is known how the camera
-            moved while the rows of the image were exposed. The readout is sought where the camera
-            states none. 0: a step stays as it is. It concerns rolling shutters and depth that is
-            late, and not a recording: of that the frame after each is known.
+        lag: with 1, a step is given at once, and again one frame later, when it is known how the
+            camera moved while the rows of the image were exposed; the readout is sought where the
+            camera states none. With 0 a step stays as it is. It serves live cameras with a rolling
+            shutter or late depth; of a recording the frame after each one is known.
         budget_ms: time after which a usable motion is not improved any more: not sought from
             the frame before, not refined on the images; and after which no motion is sought by
             sparse matches. None: the period of a live camera, else no limit; 0: no limit.

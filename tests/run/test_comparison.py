@@ -142,12 +142,12 @@ def test_resume_keeps_finished_runs(
     # as after an interruption: the first two runs are finished, the third is not
     cut, track, count = tmp_path / "cut", Odometry.track, 0
 
-    def interrupted(self: Odometry, *arguments: Any) -> Any:
+    def interrupted(self: Odometry, *arguments: Any, **given: Any) -> Any:
         nonlocal count
         count += 1
         if count == 11:
             raise KeyboardInterrupt
-        return track(self, *arguments)
+        return track(self, *arguments, **given)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Odometry, "track", interrupted)

@@ -182,11 +182,11 @@ def at_frame(
     track = hvo.Odometry.track
     frames = []
 
-    def watched(self, *arguments):
+    def watched(self, *arguments, **given):
         frames.append(None)
         if len(frames) == count:
             act()
-        return track(self, *arguments)
+        return track(self, *arguments, **given)
 
     monkeypatch.setattr(hvo.Odometry, "track", watched)
 
@@ -199,8 +199,10 @@ def test_a_motion_from_an_earlier_frame_is_compared_with_the_truth_from_there(
     truth = true_poses()
     track = hvo.Odometry.track
 
-    def from_the_first(self: hvo.Odometry, frame: hvo.Frame) -> hvo.Step:
-        step = track(self, frame)
+    def from_the_first(
+        self: hvo.Odometry, frame: hvo.Frame, **given: Any
+    ) -> hvo.Step:
+        step = track(self, frame, **given)
         if step.prev_index is None:
             return step
         T = np.linalg.inv(truth[frame.index]) @ truth[0]

@@ -306,6 +306,8 @@ class _Files(contextlib.AbstractContextManager):
         self._folder = folder
         self._header = header
         self._summary: dict[str, Any] | None = None
+        self._last: Step | None = None
+        self._lags = bool(header["options"]["track"]["lag"])
         remove(*(folder / name for name in present))
         self._save("running")
         self._trajectory = LineFile(folder / TRAJECTORY, ())
@@ -313,7 +315,15 @@ class _Files(contextlib.AbstractContextManager):
 
     def add(self, live: LiveStep, _: LiveStream) -> None:
         """Write a step."""
-        self._trajectory.add(tum_line(live.step))
+        step = live.step
+        if self._last is not None:
+            self._trajectory.add(tum_line(step.corrected or self._last))
+            self._last = None
+        if self._lags:
+            # corrected when the next frame is there
+            self._last = step
+        else:
+            self._trajectory.add(tum_line(step))
         self._steps.add(json_line(live))
 
     def finish(self, summary: dict[str, Any]) -> None:
@@ -321,6 +331,8 @@ class _Files(contextlib.AbstractContextManager):
         self._summary = summary
 
     def __exit__(self, *_: object) -> None:
+        if self._last is not None:
+            self._trajectory.add(tum_line(self._last))
         self._trajectory.close()
         self._steps.close()
         self._save("interrupted" if self._summary is None else "done")

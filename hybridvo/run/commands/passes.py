@@ -14,7 +14,7 @@ from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.selected import WholeSequence
 from hybridvo.io.data.sequence import Sequence
 from hybridvo.odometry import Odometry
-from hybridvo.run.commands.frame_reading import samples_before, skipped
+from hybridvo.run.commands.frame_reading import FramesAhead, samples_before, skipped
 from hybridvo.run.commands.stopping import stop_requested
 from hybridvo.tracking.passes import PixelTimes, TimesFinder, finders
 
@@ -74,8 +74,9 @@ def times_after_passes(
             task = bar.add_task(label, total=len(frames))
             tracker = make_tracker()
             in_time = InTimeSequence(sequence, finder.known)
+            ahead = FramesAhead(in_time, frames)
             for index in frames:
-                _track(in_time, index, tracker, finder)
+                _track(in_time, ahead, index, tracker, finder)
                 bar.advance(task)
                 stop.raise_if_requested(done=f"{number} of {passes + 1} passes")
             times = finder.found()
@@ -83,13 +84,19 @@ def times_after_passes(
 
 
 def _track(
-    sequence: InTimeSequence, index: int, tracker: Odometry, finder: TimesFinder
+    sequence: InTimeSequence,
+    ahead: FramesAhead,
+    index: int,
+    tracker: Odometry,
+    finder: TimesFinder,
 ) -> None:
     """Track a frame of a pass."""
     try:
-        frame = sequence.frame(index)
+        frame = ahead.frame(index)
+        following = ahead.after(frame)
     except (InputError, OSError) as error:
         skipped(sequence, index, tracker, error)
         return
     samples = samples_before(sequence, frame, tracker)
-    finder.add(frame, tracker.track(frame, imu=samples))
+    step = tracker.track(frame, imu=samples, following=following)
+    finder.add(frame, step)

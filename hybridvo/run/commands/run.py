@@ -58,7 +58,7 @@ from hybridvo.run.commands.export.run_export import (
     check_kinds,
     clear_export,
 )
-from hybridvo.run.commands.frame_reading import samples_before, skipped
+from hybridvo.run.commands.frame_reading import FramesAhead, samples_before, skipped
 from hybridvo.run.commands.object_rows import (
     OBJECTS,
     motion_columns,
@@ -400,6 +400,9 @@ class _Run:
     # of hybridvo-lab: errors and the picture; None where it is not installed
     scores: Any = field(default_factory=_scores_of_runs)
 
+    def __post_init__(self) -> None:
+        self.ahead = FramesAhead(self.sequence, self.frames)
+
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
         with _interruption_is_kept(self.folder):
@@ -460,16 +463,14 @@ class _Run:
         self.flow.reset()
         try:
             with stage("reading"):
-                frame = self.sequence.frame(index)
+                frame = self.ahead.frame(index)
+                following = self.ahead.after(frame)
         except (InputError, OSError) as error:
             step = skipped(self.sequence, index, tracker, error)
         else:
             started = time.perf_counter()
             samples = samples_before(self.sequence, frame, tracker)
-            if samples is None:
-                step = tracker.track(frame)
-            else:
-                step = tracker.track(frame, imu=samples)
+            step = tracker.track(frame, imu=samples, following=following)
             frame_ms = 1e3 * (time.perf_counter() - started)
             self.finder.add(frame, step)
             prev = _start_of(step, starts)

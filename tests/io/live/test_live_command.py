@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import socket
@@ -13,8 +14,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.core.options import TrackOptions
 from hybridvo.core.trajectory import read_trajectory
 from hybridvo.io.cameras.base import Reading
+from hybridvo.io.live import LiveStep
 from hybridvo.run.cli import main
 from hybridvo.run.commands import live as command
 from tests.io.live.scripted import (
@@ -75,6 +78,24 @@ def test_it_writes_what_it_found(tracker: Tracker, tmp_path: Path) -> None:
     assert state["summary"] == summary
     assert state["command"] == ["hybridvo", "live"]
     assert state["options"]["run"]["method"] == "hybrid"
+
+
+def test_the_path_on_disk_is_the_corrected_one(tmp_path: Path) -> None:
+    def step(number: int, x: float, corrected: hvo.Step | None = None) -> hvo.Step:
+        T = np.eye(4)
+        T[0, 3] = x
+        motion = hvo.RelativePose()
+        return hvo.Step(number, 10.0 + number, T, motion, None, corrected=corrected)
+
+    steps = [step(0, 0.0), step(1, 1.5), step(2, 2.5, step(1, 1.0)), step(3, 3.0)]
+    frame = frames(1)[0].frame
+    options = hvo.Options(track=TrackOptions(lag=1))
+    header = {"options": dataclasses.asdict(options)}
+    with command._Files(tmp_path, header, overwrite=False) as files:
+        for each in steps:
+            files.add(LiveStep(each, frame, 0.0, 30.0, 0, None), None)
+    path = read_trajectory(tmp_path / "trajectory.tum")
+    np.testing.assert_allclose(path.positions[:, 0], [0.0, 1.0, 2.5, 3.0])
 
 
 def test_files_of_another_run_are_not_left_beside(
