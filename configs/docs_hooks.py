@@ -49,6 +49,11 @@ def examples():
     return text
 
 
+def on_page_markdown(markdown, **_):
+    """Return a page whose link to the list of the examples leads to their page here."""
+    return markdown.replace("](../examples/README.md)", "](examples.md)")
+
+
 def on_files(files, config):
     """Add ``index.md`` (the README) and ``api/NAME.md`` for every public name."""
     readme = (

@@ -1,6 +1,4 @@
-"""The tables of the README, of docs/how-it-works.md, docs/paper.md, docs/scale.md,
-docs/moving-people.md, docs/uncertainty.md, docs/library.md, docs/live.md,
-docs/instead-of-a-t265.md and docs/results.md, from docs/results.
+"""The tables of the README, of the pages FILLED and of docs/results.md, from docs/results.
 
     python tools/make_docs.py            # fill all but the last, write docs/results.md
     python tools/make_docs.py --check    # exit code 1 if they are not up to date
@@ -32,19 +30,38 @@ from hybridvo_lab.evaluation.report import number
 PART = re.compile(r"(<!-- table:([\w ]+) -->\n)(.*?)(<!-- end:\2 -->)", re.DOTALL)
 """A part of a page that is filled: its first line, name, content and last line."""
 PAGE = {
-    "Most of the image moves": ("heavy", "pwvo_parts"),
-    "Real surfaces with moving objects": ("two_recordings", "makers", "semi_real"),
+    "Most of the image moves": ("demo", "heavy", "pwvo_parts"),
+    "Real surfaces with moving objects": (
+        "sure_when_wrong",
+        "two_recordings",
+        "semi_real",
+    ),
     "Known noise": ("scenarios", "model_noise"),
     "Recorded sequences": ("real", "wide_steps", "tracked_peers"),
     "Whole sequences": ("sequences", "memory", "video_rate", "lost"),
     "Time and memory": ("costs", "recorded"),
+    "How these figures were made": ("measured",),
 }
 """Titles of docs/results.md and their tables."""
+FILLED = (
+    "install.md",
+    "how-it-works.md",
+    "paper.md",
+    "scale.md",
+    "moving-people.md",
+    "uncertainty.md",
+    "library.md",
+    "live.md",
+    "instead-of-a-t265.md",
+    "own-data.md",
+)
+"""Pages with marked parts."""
 INTRODUCTION = """# Results
 
-Made by `python tools/make_docs.py` from the JSON files in `docs/results`. Ground truth that a \
-method is given (true flow, true depth, a true mask) is named: an oracle. [n]: pairs that are \
-wrong by more than a pixel, or without an answer. Times are wall times on a shared machine.
+All measured figures, for readers who want to check a claim of the other pages. An input from the \
+ground truth (true flow, true depth, a true mask) is called an oracle. [n]: pairs that are wrong \
+by more than a pixel, or without an answer. Times are wall times on a shared machine. The \
+[glossary](glossary.md) explains the words, [methods](methods.md) the names.
 """
 RELIABILITY_COLOURS = {"hybrid-flow": "#D55E00", "hybrid": "#0072B2"}
 """Methods of the figure and their colours (Okabe and Ito)."""
@@ -62,18 +79,7 @@ def main(argv: list[str] | None = None) -> int:
     docs = ROOT / "docs"
     results = read(docs / "results")
     texts = {docs / "results.md": page(results)}
-    names = (
-        "how-it-works.md",
-        "paper.md",
-        "scale.md",
-        "moving-people.md",
-        "uncertainty.md",
-        "library.md",
-        "live.md",
-        "instead-of-a-t265.md",
-        "own-data.md",
-    )
-    for path in (ROOT / "README.md", *(docs / name for name in names)):
+    for path in (ROOT / "README.md", *(docs / name for name in FILLED)):
         texts[path] = fill(path.read_text(encoding="utf-8"), results)
 
     stale = []
@@ -160,7 +166,7 @@ def tables(results: Results) -> Any:
     environment.filters |= {
         "number": number,
         "error": error,
-        "source": source,
+        "provenance": provenance,
         "best": best,
         "seeds": lambda rows, row: len(paper.curves(rows, row)),
         "sureness": sureness,
@@ -255,6 +261,11 @@ class Sureness(NamedTuple):
     right_not_ok: int
 
     @property
+    def oracle(self) -> bool:
+        """Whether the method was given the true flow."""
+        return "true flow" in self.maker
+
+    @property
     def wrong_ok_share(self) -> float:
         """Fraction of all answers that is wrong and ok."""
         return self.wrong_ok / max(self.answers, 1)
@@ -300,16 +311,31 @@ def of_steps(maker: str, row: dict[str, Any]) -> Sureness:
     )
 
 
-def source(content: dict[str, Any]) -> str:
-    """Where figures come from, with the machine's load: times on a
-    loaded machine are too long.
-    """
-    machine = content["machine"]
-    load = machine["load"][0] if machine["load"] else 0.0
-    return (
-        f"`{content['command']}`, commit `{content['commit']}`; {machine['processor']}, "
-        f"{machine['cores']} cores, load {load:.1f}."
-    )
+class Provenance(NamedTuple):
+    """How the figures of a file, or of a part of one, were measured."""
+
+    file: str
+    command: str
+    commit: str
+    load: str
+
+
+def provenance(results: Results) -> list[Provenance]:
+    """Each command that was run for a table, once, without the names of folders."""
+    rows = []
+    for stem, content in results.items():
+        parts = [content, *(p for p in content.values() if isinstance(p, dict))]
+        for part in parts:
+            if "command" not in part:
+                continue
+            command = re.sub(
+                r" (--(data|out|wheels) \S+|--overwrite)", "", part["command"]
+            )
+            loads = part["machine"]["load"]
+            load = f"{loads[0]:.1f}" if loads else "-"
+            rows.append(Provenance(f"{stem}.json", command, part["commit"], load))
+    # the same command for several parts: the load of the first one
+    return list({row[:3]: row for row in reversed(rows)}.values())[::-1]
 
 
 if __name__ == "__main__":
