@@ -324,6 +324,8 @@ def provenance(results: Results) -> list[Provenance]:
     """Each command that was run for a table, once, without the names of folders."""
     rows = []
     for stem, content in results.items():
+        if stem == "numbers":  # of the constants, in no table
+            continue
         parts = [content, *(p for p in content.values() if isinstance(p, dict))]
         for part in parts:
             if "command" not in part:

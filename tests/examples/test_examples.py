@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 import textwrap
@@ -198,6 +199,30 @@ def test_the_graph_is_in_one_piece(states: list[str], nodes: list[int]) -> None:
     assert list(values.keys()) == nodes
     ends = [list(graph.at(k).keys())[-1] for k in range(graph.size())]
     assert sorted(ends) == nodes
+
+
+def test_the_back_end_on_the_page_of_the_library_closes_its_loop(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("gtsam")
+    page = (ROOT / "docs/library.md").read_text(encoding="utf-8")
+    part = page.split("\n## A SLAM back end\n")[1]
+    script = tmp_path / "back_end.py"
+    script.write_text(
+        part.split("```python\n")[1].split("```")[0], encoding="utf-8"
+    )
+    world = scene()
+    # there and back, so that the last frame shows the place of the first
+    walk = [
+        replace(world.render(k), index=i) for i, k in enumerate((0, 1, 2, 1, 0))
+    ]
+    found = runpy.run_path(str(script), {"frames": walk})
+    # a prior, a factor for each motion, and the loop
+    assert found["graph"].size() == 1 + 4 + 1
+    truth = path_of(world)
+    for index, k in enumerate((0, 1, 2, 1, 0)):
+        pose = found["poses"].atPose3(index).matrix()
+        np.testing.assert_allclose(pose, truth[k], atol=5e-3)
 
 
 def loop() -> tuple[list[np.ndarray], list[tuple[int, hybridvo.Edge]]]:

@@ -226,7 +226,7 @@ def test_a_new_network_predicts_the_hypotheses_themselves() -> None:
 
 
 def test_the_shipped_maps_are_what_the_pages_say() -> None:
-    """README, how-it-works, methods and training.md: if this fails, they have to change."""
+    """how-it-works.md and training.md: if this fails, they have to change."""
     shipped = PWVO.from_pretrained()
     for seed in (1, 2):
         with torch.no_grad():

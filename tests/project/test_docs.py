@@ -116,7 +116,9 @@ def anchors(text: str) -> set[str]:
 )
 def test_every_part_of_a_page_that_is_linked_exists(page):
     text = page.read_text(encoding="utf-8")
-    assert not [name for name in anchors(text) if "--" in name], "the site joins them"
+    assert not [name for name in anchors(text) if "--" in name], (
+        "the site joins them"
+    )
     for link, part in re.findall(r"\]\(([^)#:]*\.md)?#([^)]+)\)", text):
         target = page.parent / link if link else page
         assert part in anchors(target.read_text(encoding="utf-8")), f"{link}#{part}"
