@@ -18,6 +18,7 @@ from hybridvo.evidence.one_time import states_times
 from hybridvo.flow.providers import FlowField
 from hybridvo.objects.followed import Things, after_step
 from hybridvo.objects.motions import GridView
+from hybridvo.tracking.camera_drift import Mean
 from hybridvo.tracking.readout import ReadoutFinder, Taken, surely_ms
 from hybridvo.tracking.tracker import Tracker
 from hybridvo.tracking.tracker_state import TrackerState
@@ -139,9 +140,14 @@ class Odometry(Tracker):
         return super().skip(index, timestamp, message, reason, prior)
 
     @property
+    def readout(self) -> Mean | None:
+        """What ``track.lag`` has found of the readout, ms; None: too little."""
+        return self._readout.mean()
+
+    @property
     def readout_ms(self) -> float:
-        """How long the rows of an image take, ms, as ``track.lag`` finds it; 0: not known."""
-        return surely_ms(self._readout.mean())
+        """How long the rows of an image surely take, ms, as ``track.lag`` finds it; else 0."""
+        return surely_ms(self.readout)
 
     def _with_readout(self, frame: Frame) -> Frame:
         """A frame whose camera states the readout that was found, unless it states its own."""

@@ -1,9 +1,10 @@
-"""Recordings tracked in one, two and three passes: what that is worth behind a rolling shutter.
+"""Recordings tracked in one, two and three passes, and with a lag: what it is worth.
 
     python tools/benchmark.py passes --out docs/results/passes.json
 
-No readout is stated. The recordings of a D435 have no ground truth but a T265 beside it: their
-motions over windows are compared by ``tools/benchmark.py t265``.
+They mend what a rolling shutter does; no readout is stated. The recordings of a D435 have no
+ground truth but a T265 beside it: their motions over windows are compared by
+``tools/benchmark.py t265``.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from typing import Any
 import numpy as np
 from measuring import digits, parser_of, provenance, store
 
-from hybridvo import Frame, Step, open_sequence
+from hybridvo import Frame, Odometry, Options, Step, open_sequence
+from hybridvo.core.options import TrackOptions
 from hybridvo.core.trajectory import Trajectory
+from hybridvo.tracking.camera_drift import Mean
 from hybridvo.tracking.passes import track_in_passes
 from hybridvo_lab.evaluation.metrics import evaluate
 
@@ -58,6 +61,8 @@ def main(argv: list[str] | None = None) -> int:
         for passes in PASSES:
             rows.append({"recording": name} | tracked(frames, passes, truth))
             print(rows[-1], flush=True)
+        rows.append({"recording": name} | lagging(frames, truth))
+        print(rows[-1], flush=True)
     result = provenance("benchmark.py passes", argv) | {"rows": rows}
     store(args.out, result)
     return 0
@@ -70,11 +75,29 @@ def tracked(
     begin = time.process_time()
     steps, times = track_in_passes(frames, passes)
     seconds = time.process_time() - begin
+    counted = figures(steps, times.readout, truth)
+    return {"passes": passes} | counted | {"processor_s": digits(seconds)}
+
+
+def lagging(frames: list[Frame], truth: Trajectory | None) -> dict[str, Any]:
+    """Track frames as they come, each step given once more when the next frame is there."""
+    odometry = Odometry(options=Options(track=TrackOptions(lag=1)))
+    begin = time.process_time()
+    given = [odometry.track(frame) for frame in frames]
+    seconds = time.process_time() - begin
+    last = [step.corrected for step in given[1:]] + [None]
+    steps = [new or old for old, new in zip(given, last, strict=True)]
+    counted = figures(steps, odometry.readout, truth)
+    return {"lag": 1, "passes": 1} | counted | {"processor_s": digits(seconds)}
+
+
+def figures(
+    steps: list[Step], readout: Mean | None, truth: Trajectory | None
+) -> dict[str, Any]:
+    """What comes of a path."""
     moved = steps[1:]
-    readout = times.readout
     return {
-        "frames": len(frames),
-        "passes": passes,
+        "frames": len(steps),
         "ok": sum(step.ok for step in moved),
         "degraded": sum(step.usable and not step.ok for step in moved),
         "failed": sum(not step.usable for step in moved),
@@ -82,7 +105,6 @@ def tracked(
         "ate_cm": None if truth is None else ate_cm(steps, truth),
         "readout_ms": None if readout is None else digits(readout.error),
         "readout_std_ms": None if readout is None else digits(readout.std),
-        "processor_s": digits(seconds),
     }
 
 
