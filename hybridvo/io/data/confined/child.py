@@ -18,6 +18,7 @@ import numpy as np
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.confined.limits import Limits, allow_one_request, apply_limits
+from hybridvo.io.data.confined.syscalls import refuse_network_and_programs
 from hybridvo.io.data.confined.wire import form_of, receive, send
 from hybridvo.io.data.sequence import Sequence
 
@@ -47,6 +48,8 @@ def serve(connection: Connection) -> None:
     request, _ = receive(connection)
     limits = Limits(**request["limits"])
     apply_limits(limits)
+    # where the system cannot, the other limits hold: SECURITY.md
+    refuse_network_and_programs()
     allow_one_request(limits)
     try:
         if request["do"] == "report":
