@@ -63,7 +63,7 @@ class Parser(ArgumentParser):
     def exit(self, status: int = 0, message: str | None = None) -> Any:
         """End the program; ``message`` goes to stderr."""
         if message:
-            message = printable(message)
+            message = printable(message.rstrip("\n")) + "\n"
         super().exit(status, message)
 
 

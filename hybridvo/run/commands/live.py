@@ -412,7 +412,7 @@ class _Screen(contextlib.AbstractContextManager):
 
     def say(self, text: str) -> None:
         """Show a sentence above the line."""
-        text = printable(text, keep="")
+        text = printable(text)
         self.messages.append(text)
         self._console.print(text)
 

@@ -419,7 +419,7 @@ class _Run:
         console = Console(
             stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
         )
-        name = printable(self.sequence.name, keep="")
+        name = printable(self.sequence.name)
         # In rich's markup, square brackets are tags.
         label = escape(f"{name} [{self.tracker.method}]")
 
