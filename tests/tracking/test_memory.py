@@ -22,7 +22,7 @@ from hybridvo.evidence.calibration import HANDED_OVER, SEEN_THROUGH_LOG_ODDS
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.probability import probability_of
 from hybridvo.pipeline import sure_alignment
-from hybridvo.run.commands.run import restored, saved
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo.solver.align import align_images
 from hybridvo.solver.points import grid_index
 from hybridvo.solver.visibility import visibility

@@ -18,7 +18,7 @@ from hybridvo.objects.motions import (
     Earlier,
     GridView,
 )
-from hybridvo.run.commands.run import restored, saved
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo_lab.synthetic.scenes import make_scene
 from tests.worlds import CHI2_3SIGMA
 
