@@ -55,6 +55,8 @@ MAX_JPEG_SCANS = 100
 each, and a scan of no content has some bytes."""
 PNG_BITS_PER_BYTE = 8 * 1032
 """Most bits that a byte of a PNG can hold: the limit of deflate."""
+MAX_MATRIX_BYTES = 2**12
+"""Bytes of a text of 16 numbers."""
 MAX_BYTES_PER_PIXEL = 8
 """Bytes of a pixel with four values of 16 bits, which are not compressed."""
 PNG_HEADER_BYTES = 33
@@ -279,7 +281,10 @@ def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
 def numbers_of_matrix(path: Path) -> np.ndarray:
     """Read a matrix (4, 4) from a text of 16 numbers; they may be infinite."""
     try:
-        return np.array(read_text(path).split(), np.float64).reshape(4, 4)
+        words = read_text(path, MAX_MATRIX_BYTES).split()
+        return np.array(words, np.float64).reshape(4, 4)
+    except FormatError:
+        raise
     except ValueError as error:
         raise FormatError(
             f"{path}: expected 16 numbers of a 4x4 matrix ({error})."

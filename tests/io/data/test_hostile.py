@@ -221,6 +221,15 @@ def test_images_of_one_value_are_whole_though_they_are_small(image, tmp_path):
         assert io.read_rgb(path).shape[:2] == image.shape[:2] == io.image_size(path)
 
 
+def test_the_file_of_a_matrix_holds_a_matrix_alone(tmp_path):
+    path = tmp_path / "1.txt"
+    path.write_text("1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1\n")
+    np.testing.assert_array_equal(io.read_matrix(path), np.eye(4))
+    path.write_text("1 " * 10_000)
+    with pytest.raises(FormatError, match="at most 4096 bytes"):
+        io.read_matrix(path)
+
+
 @pytest.mark.parametrize("count", [2, 200])
 def test_a_jpeg_of_many_scans(count, tmp_path):
     """Each scan is some bytes, and a walk of the decoder over all of the image."""
