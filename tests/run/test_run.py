@@ -21,8 +21,10 @@ import pytest
 
 import hybridvo as hvo
 from hybridvo.core.files import Journal, checksum
+from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import RelativePose
 from hybridvo.core.trajectory import read_trajectory
+from hybridvo.io.data.sequence import Sequence
 from hybridvo.pipeline import METHODS, Method
 from hybridvo.run.cli import main
 from hybridvo.run.commands.run_folder import CHECKPOINT, STATE, _deciding
@@ -556,3 +558,23 @@ def test_a_forged_summary_is_refused_in_one_line(
     said = capsys.readouterr().err
     assert "Traceback" not in said and said.count("\n") == 1
     assert "cannot be resumed" in said
+
+
+def test_the_path_of_another_frame(dataset, tmp_path, monkeypatch):
+    """The robot's base, 30 cm behind the camera and turned: camera path and scores stay."""
+    given = ("--flow", "file", "--method", "classical")
+    assert run(dataset, tmp_path / "camera", *given) == 0
+    T = se3_exp(np.array([0.0, 0.1, -0.3, 0.2, 0.0, 0.5]))
+    begin = Sequence._begin
+
+    def with_frame(self, *arguments):
+        begin(self, *arguments)
+        self.T_cam_frame = T
+
+    monkeypatch.setattr(Sequence, "_begin", with_frame)
+    assert run(dataset, tmp_path / "base", *given) == 0
+    expected = np.linalg.inv(T) @ poses(tmp_path / "camera") @ T
+    np.testing.assert_allclose(poses(tmp_path / "base"), expected, atol=1e-9)
+    assert (
+        load(tmp_path / "base")["ate_rmse"] == load(tmp_path / "camera")["ate_rmse"]
+    )

@@ -320,6 +320,7 @@ class TumSequence(Sequence):
     """
 
     kind = "tum"
+    choices = ("depth_offset_ms",)
     true_path: TruePath | None = None
     depth_scale = 5000.0
     markers: tuple[tuple[str, ...], ...] = (
@@ -343,6 +344,7 @@ class TumSequence(Sequence):
         """Match the images and the depth maps of two lists by time."""
         stamps, rgb_names = self._read_list(colour)
         depth_stamps, depth_names = self._read_list(depth)
+        depth_stamps = self._by_colours_clock(depth_stamps)
         if are_durations(stamps) and len(depth_names) == len(rgb_names):
             stamps = self._counted(len(stamps))
             depth_stamps = stamps

@@ -75,6 +75,9 @@ class Sequence:
         imu_samples: (M, 7) of an inertial sensor: stamp, s, of the clock of the frames; rates about
             its axes, rad/s; accelerations along them, m/s^2; None without one.
         R_cam_imu: (3, 3) rotation from its axes to those of the camera, likewise.
+        T_cam_frame: (4, 4) place of another frame of reference, such as ``base_link``, in the
+            camera's, m; None where the user asks for none.
+        chosen: What the user chose that only some kinds of sequences have: ``choices``.
         warnings: Sentences about what the user should know.
         height: Rows of every image, pixels.
         width: Columns of every image, pixels.
@@ -85,6 +88,8 @@ class Sequence:
     markers: tuple[tuple[str, ...], ...] = ()
     """Groups of file names, with wildcards. A folder that has all names of one group belongs to
     this reader."""
+    choices: tuple[str, ...] = ()
+    """Names of the keyword arguments of ``open_sequence`` that only some readers take."""
     depth_source = "sensor"
     """``sensor``, ``stereo``, ``file``, or ``true``: depth of a renderer, which is an oracle."""
     flow_is_true = False
@@ -103,11 +108,14 @@ class Sequence:
         depth_scale: float | None = None,
         mask: str | Path | None = None,
         needs_depth: bool = True,
+        **chosen: str,
     ) -> None:
         self._begin(root, root.name, camera, depth_scale, mask)
         self._needs_depth = needs_depth
+        self.chosen = chosen
         self._list_files()
         self._check_frames()
+        self._check_depth_offset()
         self.mask_files = self._list_masks()
         self._take_size()
         self._take_camera()
@@ -146,6 +154,8 @@ class Sequence:
         self.poses: np.ndarray | None = None
         self.imu_samples: np.ndarray | None = None
         self.R_cam_imu: np.ndarray | None = None
+        self.T_cam_frame: np.ndarray | None = None
+        self.chosen = {}
         self.warnings: list[str] = []
         self._camera: Camera | None = None
         self._lens: UndistortionMaps | None = None
@@ -192,6 +202,19 @@ class Sequence:
         return ImuSamples(
             chosen[:, 0], chosen[:, 1:4], self.R_cam_imu, accelerations
         )
+
+    def _by_colours_clock(self, depth_stamps: np.ndarray) -> np.ndarray:
+        """Return stamps of depth maps, seconds, without the offset that the user states."""
+        return depth_stamps - float(self.chosen.get("depth_offset_ms", 0)) / 1000
+
+    def _check_depth_offset(self) -> None:
+        """Refuse an offset of stamps by which nothing was matched."""
+        if "depth_offset_ms" in self.chosen and self.depth_timestamps is None:
+            raise InputError(
+                f"--depth-offset-ms: {self.root}: depth has no stamps of its own: it is matched by "
+                "names or by order. Of depth that is measured later than its image state "
+                "--depth-lag-ms."
+            )
 
     def _take_imu(self, samples: np.ndarray, R_cam_imu: np.ndarray) -> None:
         """Keep the samples (M, 7) of an inertial sensor that are finite and rise in time."""
@@ -304,6 +327,7 @@ class Sequence:
             "lens": lens,
             "depth_scale": self._given_scale or self.depth_scale,
             "mask": None if mask is None else os.path.relpath(mask, self.root),
+            **self.chosen,
         }
 
     # -- what a reader overrides -------------------------------------------------------

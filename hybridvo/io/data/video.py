@@ -108,7 +108,7 @@ class VideoSequence(StreamSequence):
 
     kind = "video"
     depth_source = "file"
-    choices: tuple[str, ...] = ("depth_dir",)
+    choices: tuple[str, ...] = ("depth_dir", "depth_offset_ms")
 
     @classmethod
     def knows_without_depth(cls, folder: Path) -> bool:
@@ -207,7 +207,9 @@ class VideoSequence(StreamSequence):
                     f"{self.root}: {len(files)} depth maps for {count} frames: name them by "
                     "the number of their frame, from 0, or write depth_timestamps.txt."
                 )
+            depth_stamps = self._by_colours_clock(depth_stamps)
             pairs = lists.depth_at(stamps, depth_stamps, self.root, self.warnings)
+            self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
         self.rgb_files = []
         self._frame_at = [i for i, _ in pairs]
         self.depth_files = [files[j] for _, j in pairs]

@@ -239,6 +239,15 @@ def reading(camera: str = CAMERA_HELP) -> tuple[Argument, ...]:
         word("--topic-depth TOPIC", "of depth, in a bag (default: guessed)"),
         word("--topic-info TOPIC", "of colour's CameraInfo (default: guessed)"),
         word("--topic-truth TOPIC", "of true poses (default: by its name)"),
+        word("--topic-imu TOPIC", "of the IMU, in a bag (default: guessed)"),
+        word(
+            "--imu-rotation x,y,z,w",
+            "quaternion from the axes of the IMU to the camera's (else /tf_static)",
+        ),
+        number(
+            "--depth-offset-ms MS",
+            "by how much the stamps of depth are late: subtracted before matching",
+        ),
         word("--depth-dir DIR", "depth of a video (default: depth beside)"),
         word(
             "--stereo METRES",
@@ -365,6 +374,10 @@ RUN = command(
     MODE,
     WEIGHTS,
     word("--out DIR", "output folder (default: runs/NAME)"),
+    word(
+        "--frame NAME",
+        "write the path of this frame, fixed to the camera by /tf_static, as base_link",
+    ),
     METHOD,
     MAX_FAILED,
     switch("--strict", "a broken frame ends the run", default=None),

@@ -511,7 +511,7 @@ class _Run:
         }
 
     def _write_trajectory(self, steps: pd.DataFrame) -> Trajectory:
-        """Write the path and the motions of a run; returns the path."""
+        """Write the path and the motions of a run; returns the path of the camera."""
         folder = self.folder.path
         columns: dict[str, Any] = {
             name: np.array(steps[name].tolist()) for name in ARRAYS
@@ -527,8 +527,11 @@ class _Run:
             ),
         )
         trajectory = Trajectory(columns["timestamp"], poses)
-        trajectory.save(folder / "trajectory.tum")
-        trajectory.save(folder / "trajectory.kitti")
+        written = trajectory
+        if self.sequence.T_cam_frame is not None:
+            written = trajectory.of_frame(self.sequence.T_cam_frame)
+        written.save(folder / "trajectory.tum")
+        written.save(folder / "trajectory.kitti")
         with atomic_write(folder / "steps.npz", "wb") as file:
             np.savez(file, **columns)
         return trajectory

@@ -91,6 +91,7 @@ class KinectSequence(StreamSequence):
     """
 
     kind = "kinect"
+    choices = ("depth_offset_ms",)
     depth_scale = MILLIMETRES
     markers = (("*.mkv",),)
 
@@ -137,6 +138,7 @@ class KinectSequence(StreamSequence):
             raise InputError(
                 f"{self.root}: no frames: the {lacking} track is empty."
             )
+        depth = self._by_colours_clock(depth)
         pairs = lists.depth_at(rgb, depth, self.root, self.warnings)
         self._pairs = [
             (self._recording.colour.times[i], self._recording.depth.times[j])

@@ -28,7 +28,10 @@ SOURCES = ("depth_source", "flow_is_true", "depth_scale", "frames_per_second")
 """Attributes of its class, likewise."""
 FILES = ("rgb_files", "depth_files", "flow_files", "mask_files")
 """Lists of paths."""
-ARRAYS = ("timestamps", "depth_timestamps", "poses", "imu_samples", "R_cam_imu")
+ARRAYS = (
+    *("timestamps", "depth_timestamps", "poses"),
+    *("imu_samples", "R_cam_imu", "T_cam_frame"),
+)
 """Arrays of numbers, or None."""
 IMAGES = ("rgb", "depth", "depth_variance", "mask")
 """What a frame is made of."""

@@ -385,6 +385,8 @@ class ConfinedSequence(Sequence):
             shapes = shapes and samples.ndim == 2 and samples.shape[1] == 7
             turned = self.R_cam_imu
             shapes = shapes and turned is not None and turned.shape == (3, 3)
+        if self.T_cam_frame is not None:
+            shapes = shapes and self.T_cam_frame.shape == (4, 4)
         if not shapes:
             raise FormatError("arrays of another shape")
 

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.types import Frame
+from hybridvo.io.data.sequence import Sequence
 from hybridvo.run.calibration import (
     CLOCK_SMOOTHING,
     MAX_CLOCK_OFFSET_S,
@@ -84,11 +85,13 @@ def one_clock(sequence: Any, pairs: int) -> Diagnosis:
     is_certain = abs(offset.seconds) > CLOCK_SIGMAS * offset.std
     if not (is_far and is_certain):
         return Diagnosis(False, text)
-    remedy = f"add {-ms:.0f} ms to the stamps of depth"
-    if ms > 0:
-        remedy = f"subtract {ms:.0f} ms from the stamps of depth"
+    # a live camera hands out both at once, and so does a folder that is matched by names
+    has_stamps = getattr(sequence, "depth_timestamps", None) is not None
+    is_matched = isinstance(sequence, Sequence) and has_stamps
+    option = "--depth-offset-ms" if is_matched else "--depth-lag-ms"
     return Diagnosis(
-        True, f"{text}: {remedy}, or let the camera synchronise the two"
+        True,
+        f"{text}: pass {option} {ms:.0f}, or let the camera synchronise the two",
     )
 
 
