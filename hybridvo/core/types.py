@@ -230,6 +230,26 @@ def _integer_depth_remedy(depth: np.ndarray) -> str:
     )
 
 
+def _size_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
+    """What to do with an image of another height and width than the camera's."""
+    height, width = array.shape[:2]
+    if (height, width) == (camera.width, camera.height):
+        return (
+            f"Height and width are exchanged: is it Camera(height={height}, width={width})? Of an "
+            f"image that was turned, take the camera that was turned with it; to transpose it "
+            f"would mirror it"
+        )
+    if name in ("depth", "depth_variance"):
+        return (
+            "Depth must be registered to the image, not resized: let the camera's driver do it, or "
+            "hybridvo.io.data.registration.register_depth"
+        )
+    return (
+        "Give the camera of images of this size; hybridvo.io.data.resize.resize_camera makes it of "
+        "one for larger images that were reduced"
+    )
+
+
 def _shape_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
     """What to do with an image whose shape is not the one expected."""
     height, width = camera.shape
@@ -250,11 +270,11 @@ def _shape_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
             "Resize it to the image's size and scale its values, u by the widths' ratio "
             "and v by the heights'"
         )
-    if array.shape == (width, height, *array.shape[2:]):
-        return "Height and width are exchanged: transpose it"
     if array.shape[:2] == (height, width):
         return "Its height and width fit, its number of channels does not"
-    return "Resize with hybridvo.resize_frame, which also scales the camera"
+    if array.ndim not in (2, 3):
+        return "Hand in one image, without a batch"
+    return _size_remedy(name, array, camera)
 
 
 def _check_image(

@@ -15,6 +15,7 @@ import numpy as np
 from hybridvo.core.checks import as_rigid
 from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import unpacked_limit
+from hybridvo.core.pages import page
 from hybridvo.core.trajectory import FILE_TOLERANCE, to_seconds
 from hybridvo.core.types import Camera
 from hybridvo.io.data.camera_file import parse_camera
@@ -155,7 +156,7 @@ class ArraySequence(StreamSequence):
             there = abbreviated(self._names()) or "none"
             raise FormatError(
                 f"{self.root}: no frames: there is no array '{name}'; there are: {there}. "
-                "Expected rgb, depth and K, as docs/own-data.md has them."
+                f"Expected rgb, depth and K, as {page('own-data')} has them."
             )
         is_rgb = name == "rgb"
         shapes = array.ndim == 3 or (

@@ -67,6 +67,8 @@ READERS: dict[str, type[Sequence]] = {
     "transforms": TransformsSequence,
 }
 """The readers by kind, in the order in which they are tried on a folder."""
+WITHOUT_FOLDERS = ("bag", "arrays", "sens", "record3d", "kinect", "video")
+"""Kinds whose recordings are files: a folder beside them is no part of them."""
 LOOKED_AT = 200
 """Entries of a folder that is no sequence in which sequences are looked for."""
 RECORDINGS = ".bag, .mcap, .db3, .npz, .mkv, .mp4, .r3d, .sens"
@@ -392,7 +394,8 @@ def _why_unknown(folder: Path) -> str:
     if lack := _lack_of(folder):
         return lack
     above = folder.absolute().parent
-    if any(reader.knows(above) for reader in READERS.values()):
+    layouts = [READERS[kind] for kind in READERS if kind not in WITHOUT_FOLDERS]
+    if any(reader.knows(above) for reader in layouts):
         return f"a part of a sequence: give the folder above it, {above}."
     names = [path.name for path in entries]
     content = abbreviated(names) or "nothing"

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from hybridvo import __version__
 from hybridvo.core.errors import did_you_mean, printable
+from hybridvo.core.pages import page
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.run.commands import dispatch
 from hybridvo.run.commands.dispatch import CommandResult, calling, from_laboratory
@@ -474,7 +475,7 @@ COMPARE = command(
     ),
     word(
         "--protocol",
-        "score a data set as papers do: docs/protocols.md",
+        f"score a data set as papers do: {page('protocols')}",
         choices=PROTOCOLS,
     ),
     JOBS,
@@ -685,7 +686,7 @@ def build_parser() -> ArgumentParser:
     for command in COMMANDS:
         _add(commands, command)
     train = commands.add_parser(
-        "train", help=TRAIN, description=f"{TRAIN} See docs/training.md."
+        "train", help=TRAIN, description=f"{TRAIN} See {page('training')}."
     )
     tasks = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
     for command in TRAINING_COMMANDS:

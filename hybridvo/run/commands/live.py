@@ -301,7 +301,8 @@ class _Files(contextlib.AbstractContextManager):
         if present and not overwrite:
             names = ", ".join(present[:3])
             raise InputError(
-                f"{folder}: holds results ({names}). Pass --overwrite, or another --out."
+                f"{folder}: holds results ({names}). Pass another --out, or "
+                "--overwrite to delete them first."
             )
         self._folder = folder
         self._header = header

@@ -113,9 +113,7 @@ class RunFolder:
         self._is_resumed = bool(present) and mode == "resume"
         if present and mode == "new":
             names = ", ".join(present[:3])
-            choices = (
-                "--overwrite to replace them, --resume to go on, or another --out"
-            )
+            choices = "--resume to go on, another --out, or --overwrite to delete them first"
             raise InputError(f"{path}: holds results ({names}). Pass {choices}.")
         is_unfinished = False
         if present and mode == "resume":

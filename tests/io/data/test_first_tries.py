@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
 import hybridvo as hvo
 from hybridvo.core.errors import InputError
-from hybridvo.core.types import Camera
+from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.lists import poses_at
 from hybridvo.io.data.open import iter_pairs, open_sequence
 from hybridvo.io.data.resize import resize_camera, resize_frame
+from tests import bags
 from tests import sequences as write
 from tests.doors import refuses
 
@@ -211,3 +213,43 @@ def test_arguments_of_pairs(arguments, word, tmp_path):
     assert len(list(iter_pairs(sequence, start=np.int64(1), stop=np.int64(3)))) == 1
     with pytest.raises(InputError, match="one frame"):
         sequence[0:2]
+
+
+def test_a_folder_beside_recordings_is_no_part_of_them(tmp_path):
+    K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
+    rgb = np.zeros((3, 12, 16, 3), np.uint8)
+    np.savez(tmp_path / "walk.npz", rgb=rgb, depth=np.ones((3, 12, 16)), K=K)
+    bags.plain_bag(tmp_path, "mcap")
+    (tmp_path / "drive" / "drive.mcap").rename(tmp_path / "drive.mcap")
+    captures = tmp_path / "captures"
+    captures.mkdir()
+    for names in ((), ("color_0.png", "depth_0.png")):
+        for name in names:
+            cv2.imwrite(str(captures / name), rgb[0])
+        with pytest.raises(InputError) as caught:
+            open_sequence(captures)
+        assert "folder above" not in str(caught.value)
+        assert "rgb/" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((640, 480), ("Camera(height=640, width=480)?", "mirror")),
+        ((240, 320), ("registered", "register_depth")),
+    ],
+)
+def test_depth_of_another_size_names_what_helps(shape, words):
+    camera = Camera(fx=500, fy=500, cx=319.5, cy=239.5, height=480, width=640)
+    rgb = np.zeros((480, 640, 3), np.uint8)
+    with pytest.raises(InputError) as caught:
+        Frame(rgb, np.ones(shape, np.float32), camera)
+    said = str(caught.value)
+    assert all(word in said for word in words)
+    assert "transpose it:" not in said and "Resize" not in said
+
+
+def test_an_image_of_another_size_names_the_camera():
+    camera = Camera(fx=500, fy=500, cx=319.5, cy=239.5, height=480, width=640)
+    with pytest.raises(InputError, match=r"resize_camera"):
+        Frame(np.zeros((240, 320, 3), np.uint8), None, camera)

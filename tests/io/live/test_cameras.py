@@ -206,3 +206,17 @@ def test_files_that_are_gone_are_named_as_such(
     reading = camera.read(9.0)
     assert reading.is_gone and reading.frame is None
     assert reading.note == f"files are gone since frame {reading.number}"
+
+
+def test_an_image_that_is_gone_is_named_although_depth_is_there(
+    image_walk: Path, tmp_path: Path
+) -> None:
+    recording = tmp_path / "walk"
+    shutil.copytree(image_walk, recording)
+    camera, _ = play(recording)
+    assert camera.read(9.0).frame is not None
+    for path in hvo.open_sequence(recording).rgb_files[1:]:
+        path.unlink()
+    reading = camera.read(9.0)
+    assert reading.is_gone and reading.frame is None
+    assert reading.note.startswith(f"the image of frame {reading.number} is gone")
