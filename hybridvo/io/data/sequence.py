@@ -16,7 +16,11 @@ import cv2
 import numpy as np
 
 from hybridvo.core.checks import brief
-from hybridvo.core.depth_units import depth_unit_fix, typical_depth
+from hybridvo.core.depth_units import (
+    depth_unit_fix,
+    scale_is_unknown,
+    typical_depth,
+)
 from hybridvo.core.errors import FormatError, InputError, format_errors, printable
 from hybridvo.core.imu import ImuSamples, rising
 from hybridvo.core.trajectory import check_increasing
@@ -349,10 +353,8 @@ class Sequence:
             is_whole = stored.dtype.kind == "u"
             scale = self.depth_scale if is_whole else 1.0
         if scale is None:
-            needed = "'depth_scale' in camera.yaml, or --depth-scale: units per metre, 1000 for mm"
-            raise InputError(
-                f"{path}: depth is of whole numbers: expected {needed}."
-            )
+            where = "'depth_scale' in camera.yaml"
+            raise InputError(f"{path}: {scale_is_unknown(stored, where)}")
         return in_metres(stored, scale)
 
     def _read_flow(

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number
+from hybridvo.core.depth_units import scale_is_unknown
 from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import read_rows, read_text
 from hybridvo.core.geometry import make_transform
@@ -278,10 +279,8 @@ class VideoSequence(StreamSequence):
         if stored.dtype.kind != "u":
             return stored.astype(np.float32)
         if self._given_scale is None:
-            raise InputError(
-                f"{path}: depth is of whole numbers: expected 'depth_scale' in {CAMERA_FILE}, "
-                "or --depth-scale: units per metre, 1000 for mm."
-            )
+            where = f"'depth_scale' in {CAMERA_FILE}"
+            raise InputError(f"{path}: {scale_is_unknown(stored, where)}")
         return in_metres(stored, self._given_scale)
 
 

@@ -69,6 +69,7 @@ from hybridvo.run.commands.run_folder import (
     RunFolder,
     weights_hash,
 )
+from hybridvo.run.commands.run_hints import hint_of_run, next_command
 from hybridvo.run.commands.stopping import stop_requested
 from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo.run.commands.terminal import STYLES
@@ -500,6 +501,18 @@ class _Run:
                 states=steps["status"].tolist(),
                 covariances=_position_covariances(steps),
             )
+        hint = hint_of_run(
+            self.sequence,
+            self.folder.rows,
+            summary.get("readout_ms", 0.0),
+            options.passes,
+        )
+        if hint is not None:
+            words = self.folder.header["command"]
+            summary["likely"] = {
+                "cause": hint.cause,
+                "command": next_command(words, self.sequence, hint, folder),
+            }
         existing = [
             folder / name for name in (*RESULTS, STATE) if (folder / name).exists()
         ]

@@ -96,6 +96,10 @@ def _run_text(content: Content) -> list[str]:
     if export:
         text = f"{export['folder']} ({', '.join(export['kinds'])})"
         lines.append(_labelled("export", text))
+    if content.get("likely"):
+        likely = content["likely"]
+        lines.append(_labelled("likely cause", likely["cause"]))
+        lines.append(_labelled("try", likely["command"]))
     if content.get("next"):
         lines += _next(content["least_sure"], content["next"])
     return lines

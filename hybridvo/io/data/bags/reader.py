@@ -120,6 +120,7 @@ class BagSequence(StreamSequence):
         self._take_lens(index, rgb.shape[:2])
         usual = self._unit_of_realsense() or MILLIMETRES
         self._units = units_per_metre(self._given_scale, usual, self.warnings)
+        self._used_scale = self._units
         self._take_registration(index)
         self._take_truth(index)
         self._take_gyroscope(index)
@@ -129,7 +130,8 @@ class BagSequence(StreamSequence):
         """Return what decides how the bag is read, JSON-ready."""
         topics = self.topics._asdict()
         topics.pop("guessed")
-        return super().opened_with() | {"topics": topics}
+        scale = {"depth_scale": self._used_scale}
+        return super().opened_with() | scale | {"topics": topics}
 
     def _what_is_used(self, index: _Index) -> str:
         """State how much of a damaged bag can be read, and how much there was, where known."""
@@ -495,6 +497,7 @@ class BagSequence(StreamSequence):
         stored = ros.depth_image(message)
         if stored.dtype == np.float32:
             scale = self._given_scale or 1.0
+            self._used_scale = scale
             return stored if scale == 1.0 else stored / np.float32(scale)
         depth = stored.astype(np.float32) / np.float32(self._units)
         depth[stored == np.iinfo(stored.dtype).max] = 0.0

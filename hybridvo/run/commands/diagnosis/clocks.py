@@ -89,9 +89,11 @@ def one_clock(sequence: Any, pairs: int) -> Diagnosis:
     has_stamps = getattr(sequence, "depth_timestamps", None) is not None
     is_matched = isinstance(sequence, Sequence) and has_stamps
     option = "--depth-offset-ms" if is_matched else "--depth-lag-ms"
+    value = f"{ms:.0f}"
     return Diagnosis(
         True,
-        f"{text}: pass {option} {ms:.0f}, or let the camera synchronise the two",
+        f"{text}: pass {option} {value}, or let the camera synchronise the two",
+        (option, value),
     )
 
 
