@@ -81,6 +81,12 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def __repr__(self) -> str:
+        first, last = self.timestamps[[0, -1]]
+        steps = np.diff(self.positions, axis=0)
+        length = float(np.linalg.norm(steps, axis=1).sum())
+        return f"Trajectory({len(self)} poses, {first:.6f} to {last:.6f} s, {length:.3g} m long)"
+
     @property
     def positions(self) -> np.ndarray:
         """The camera centres in the world frame, (N, 3), metres."""
