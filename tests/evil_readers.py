@@ -116,7 +116,7 @@ class EvilSequence(StreamSequence):
         if "early" in self.chosen:
             DEEDS[self.chosen["deed"]]()
         self.timestamps = np.arange(FRAMES) / 30
-        self._camera = Camera(40, 40, 15.5, 11.5, 24, 32)
+        self._camera = Camera(40, 40, 15.5, 11.5, height=24, width=32)
 
     def _images(self, index: int) -> FrameImages:
         if index == BAD:

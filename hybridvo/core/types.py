@@ -8,7 +8,7 @@ y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent vec
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +73,8 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    # width comes first in other libraries: nobody has to remember it
+    _: KW_ONLY
     height: int
     width: int
     readout_ms: float = 0.0
@@ -797,7 +799,9 @@ class PairBatch:
         def camera(name: str, k: int) -> Camera:
             K = np.asarray(arrays[name])[k].astype(float)
             height, width = self.depth_prev.shape[1:]
-            return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
+            return Camera(
+                K[0, 0], K[1, 1], K[0, 2], K[1, 2], height=height, width=width
+            )
 
         pairs = []
         for k in range(len(self.flow)):

@@ -351,7 +351,12 @@ def warm_up(
     # the second takes the parallel kernels
     for height, width in ((48, 64), (320, 400)):
         camera = Camera(
-            width, width, (width - 1) / 2, (height - 1) / 2, height, width
+            width,
+            width,
+            (width - 1) / 2,
+            (height - 1) / 2,
+            height=height,
+            width=width,
         )
         u = np.arange(width)
         v = np.arange(height)[:, None]

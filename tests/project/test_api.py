@@ -89,7 +89,7 @@ SCRIPT = """
 import numpy as np
 import hybridvo as hvo
 
-camera = hvo.Camera(525.0, 525.0, 319.5, 239.5, 480, 640)
+camera = hvo.Camera(525.0, 525.0, 319.5, 239.5, height=480, width=640)
 frame = hvo.Frame(None, np.ones((480, 640), np.float32), camera)
 pair = hvo.FramePair(frame, frame, None)
 reveal_type(camera)
@@ -232,3 +232,10 @@ def test_a_step_keeps_a_byte_for_each_weight() -> None:
     np.testing.assert_array_equal(again.weights, kept.weights)
     with pytest.raises(dataclasses.FrozenInstanceError):
         kept.weights = None
+
+
+def test_nobody_has_to_remember_whether_height_or_width_comes_first() -> None:
+    with pytest.raises(TypeError, match="positional"):
+        hybridvo.Camera(500, 500, 319.5, 239.5, 640, 480)
+    camera = hybridvo.Camera(500, 500, 319.5, 239.5, width=640, height=480)
+    assert camera.shape == (480, 640)

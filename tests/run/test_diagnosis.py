@@ -29,7 +29,7 @@ from hybridvo.run.commands.doctor import diagnose_camera
 from hybridvo.tracking.camera_drift import Mean
 from hybridvo.tracking.passes import PixelTimes
 
-CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 120, 160)
+CAMERA = Camera(150.0, 150.0, 79.5, 59.5, height=120, width=160)
 RATE = 30
 
 
@@ -141,7 +141,14 @@ def test_depth_of_another_focal_length(shared_data: Path) -> None:
     for number in range(3, 36, 8):
         bgr = cv2.imread(str(folder / "rgb" / f"{number:06d}.jpg"))
         stored = cv2.imread(str(folder / "depth" / f"{number:06d}.png"), -1)
-        camera = Camera(534.3, 534.7, 308.6, 242.1, *stored.shape)
+        camera = Camera(
+            534.3,
+            534.7,
+            308.6,
+            242.1,
+            height=stored.shape[0],
+            width=stored.shape[1],
+        )
         rgb = np.ascontiguousarray(bgr[..., ::-1])
         frames.append(Frame(rgb, np.float32(stored / 1000), camera, number / 5))
     answer = zoomed_registration(Captured("unregistered", frames))

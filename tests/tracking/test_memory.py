@@ -43,7 +43,7 @@ from hybridvo_lab.synthetic.slow_scenes import slow_scene
 from tests import slow_walk
 
 SIZE = (120, 160)
-CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, *SIZE)
+CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, height=SIZE[0], width=SIZE[1])
 WALL = 2.0
 BOX = np.s_[30:90, 60:100]
 LARGE_BOX = np.s_[10:110, 40:130]

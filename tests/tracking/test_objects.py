@@ -25,7 +25,7 @@ from hybridvo_lab.synthetic.scenes import make_scene
 from tests.worlds import CHI2_3SIGMA
 
 SIZE = (120, 160)
-CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, *SIZE)
+CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, height=SIZE[0], width=SIZE[1])
 WALL = 3.0
 ON = Options(track=TrackOptions(objects="auto"))
 OFF = Options(track=TrackOptions(objects="off"))

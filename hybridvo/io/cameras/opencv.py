@@ -93,7 +93,7 @@ class OpenCVCamera:
         if given is None:
             focal = self._capture.get(cv2.CAP_OPENNI_DEPTH_GENERATOR_FOCAL_LENGTH)
             given = (focal, focal, (width - 1) / 2, (height - 1) / 2)
-        return Lens(Camera(*given, height, width))
+        return Lens(Camera(*given, height=height, width=width))
 
     def close(self) -> None:
         """Let the device go."""

@@ -53,7 +53,9 @@ def check_alike(one: Sequence, other: Sequence) -> None:
 def test_a_bag_is_read_alike_in_a_child(kind: str, tmp_path: Path) -> None:
     path = bags.plain_bag(tmp_path, kind)
     given = {
-        "camera": Camera(*bags.K, *bags.SIZE, readout_ms=3),
+        "camera": Camera(
+            *bags.K, height=bags.SIZE[0], width=bags.SIZE[1], readout_ms=3
+        ),
         "depth_scale": 0.5,
     }
     for options in ({}, given):

@@ -130,7 +130,7 @@ def test_intrinsics_of_open3d_and_numpy(mine):
     for content in (intrinsic, {"extrinsic": [1.0] * 16, "intrinsic": intrinsic}):
         path.write_text(json.dumps(content))
         assert open_sequence(mine, camera=path).camera(0) == Camera(
-            20, 21, 4.5, 2.5, 6, 10
+            20, 21, 4.5, 2.5, height=6, width=10
         )
     by_rows = np.reshape(MATRIX, (3, 3)).T
     path.write_text(
@@ -140,7 +140,7 @@ def test_intrinsics_of_open3d_and_numpy(mine):
     path = mine.parent / "K.npy"
     np.save(path, by_rows)
     assert open_sequence(mine, camera=path).camera(0) == Camera(
-        20, 21, 4.5, 2.5, 6, 10
+        20, 21, 4.5, 2.5, height=6, width=10
     )
     np.save(path, by_rows.T)
     assert "[fx, 0, cx]" in refused(mine, camera=path)
@@ -172,7 +172,11 @@ def test_recordings_that_are_known_are_named_with_what_to_do(
 
 # arguments
 
-TINY = {"rgb": None, "depth": np.ones((4, 5)), "camera": Camera(9, 9, 2, 2, 4, 5)}
+TINY = {
+    "rgb": None,
+    "depth": np.ones((4, 5)),
+    "camera": Camera(9, 9, 2, 2, height=4, width=5),
+}
 
 test_arguments = refuses(
     [

@@ -498,4 +498,4 @@ def test_a_huge_number_in_a_name_costs_nothing(kind, pattern, tmp_path):
 @pytest.mark.parametrize("size", ["-8", "x", "0", "9" * 400])
 def test_a_size_that_is_text_is_one_line(size: str) -> None:
     with pytest.raises(InputError, match="height: expected a positive integer"):
-        Camera(40, 40, 15.5, 11.5, size, 32)
+        Camera(40, 40, 15.5, 11.5, height=size, width=32)

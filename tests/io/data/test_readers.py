@@ -111,7 +111,7 @@ def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
         )
         given = open_sequence(sequence.root, camera="500,501,320,240")
         assert (
-            given.camera(0) == Camera(500, 501, 320, 240, 480, 640)
+            given.camera(0) == Camera(500, 501, 320, 240, height=480, width=640)
             and given[0].mask is None
         )
 

@@ -83,7 +83,7 @@ def test_a_broken_sdk_says_why(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_depth_out_of_range_is_taken_away() -> None:
-    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, height=2, width=3)
     settings = CameraSettings(min_depth_m=0.5, max_depth_m=4.0)
     depth = np.array([[0.4, 0.5, 4.0], [4.1, np.nan, 0.0]])
     made = FrameMaker(Lens(camera), settings).frame(
@@ -95,7 +95,7 @@ def test_depth_out_of_range_is_taken_away() -> None:
 
 
 def test_the_shutter_is_that_of_the_settings(image_walk: Path) -> None:
-    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, height=2, width=3)
     maker = FrameMaker(Lens(camera), CameraSettings(readout_ms=18.0))
     made = maker.frame(np.zeros((2, 3), np.uint8), None, 0.0)
     assert made.camera.readout_ms == 18
@@ -108,7 +108,7 @@ def test_the_shutter_is_that_of_the_settings(image_walk: Path) -> None:
 
 
 def test_an_infrared_image_is_of_the_time_of_its_depth() -> None:
-    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, height=2, width=3)
     for image, expected in (("color", (32, 7)), ("infrared", (0, 0))):
         settings = replace(read_preset("d435"), image=image, depth_lag_ms=7)
         maker = FrameMaker(Lens(camera), settings)
@@ -118,7 +118,7 @@ def test_an_infrared_image_is_of_the_time_of_its_depth() -> None:
 
 def test_the_lens_bends_nothing_afterwards() -> None:
     """A point lands where a pinhole puts it, wherever the lens put it before."""
-    camera = hvo.Camera(60.0, 60.0, 31.5, 23.5, 48, 64)
+    camera = hvo.Camera(60.0, 60.0, 31.5, 23.5, height=48, width=64)
     distortion = (-0.5, 0.2, 0.01, -0.02, 0.0)
     point = np.array([[0.45, 0.3, 1.0]])
     zero = np.zeros(3)

@@ -454,8 +454,8 @@ def _lens_of(
             p["fy"] * height,
             p["cx"] * width - left - 0.5,
             p["cy"] * height - top - 0.5,
-            size[1],
-            size[0],
+            height=size[1],
+            width=size[0],
         )
     order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     return Lens(pinhole, tuple(p[name] for name in order), "rational_polynomial")
