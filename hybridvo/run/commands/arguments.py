@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from argparse import SUPPRESS, Action, ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,6 +40,25 @@ KEY_WIDTH = 32
 """Width of the keys in what ``--set help`` prints, characters."""
 
 
+def with_negative_lists(words: Sequence[str]) -> list[str]:
+    """Return words with each list that begins with a minus joined to its option.
+
+    argparse takes such a list for an option.
+
+    Example:
+        >>> with_negative_lists(["run", "x", "--imu-rotation", "-0.5,0.5,-0.5,0.5"])
+        ['run', 'x', '--imu-rotation=-0.5,0.5,-0.5,0.5']
+    """
+    joined = list[str]()
+    for word in words:
+        is_of_option = bool(joined) and joined[-1].startswith("--")
+        if is_of_option and re.fullmatch(r"-[\d.e+-]+(,[\d.e+-]+)+", word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 class Parser(ArgumentParser):
     """A parser whose errors quote arguments without the characters that steer a terminal.
 
@@ -48,7 +67,8 @@ class Parser(ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse arguments, and refuse those that are left over."""
-        parsed, unknown = super().parse_known_args(args, namespace)
+        words = None if args is None else with_negative_lists(args)
+        parsed, unknown = super().parse_known_args(words, namespace)
         if unknown:
             self.error(
                 f"unrecognized arguments: {' '.join(unknown)}{self._near(unknown)}"

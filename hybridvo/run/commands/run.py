@@ -474,6 +474,8 @@ class _Run:
                 folder / OBJECTS, [each for row in rows for each in row["objects"]]
             )
         summary["passes"] = options.passes
+        if "frame" in self.sequence.chosen:
+            summary["frame"] = self.sequence.chosen["frame"]
         times = self.finder.found()
         if times.readout is not None and times.readout_is_known:
             summary["readout_ms"] = times.readout_ms

@@ -74,6 +74,8 @@ def _run_text(content: Content) -> list[str]:
         _labelled("method", content["method"]),
         _labelled("inputs", f"flow: {flow}; depth: {content['depth_source']}"),
     ]
+    if content.get("frame"):
+        lines.append(_labelled("path of", f"'{content['frame']}' (trajectory.tum)"))
     if content["oracle"]:
         oracle = " and ".join(content["oracle"])
         lines.append(_labelled("ORACLE", f"uses {oracle} (ground truth)"))

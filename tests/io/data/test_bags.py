@@ -904,6 +904,10 @@ def test_the_rotation_of_an_imu_without_transforms_is_stated(
     turned = sequence.imu(*sequence.timestamps[:2])
     assert turned is not None
     np.testing.assert_allclose(turned.R_cam_imu @ RATES, (0, 0.3, 0), atol=1e-9)
+    # of the two quaternions of a rotation, the one that begins with a minus
+    opposite = ",".join(str(-value) for value in (0.5, 0.5, -0.5, 0.5))
+    args = build_parser().parse_args(["run", "x", "--imu-rotation", opposite])
+    assert args.imu_rotation == opposite
     for wrong in ("0,0,0", "1,1,1,1", "a,b,c,d"):
         assert "x,y,z,w" in refused(path, imu_rotation=wrong)
 
@@ -935,7 +939,10 @@ def test_the_path_of_the_base_is_written(
     )
     command = ["run", str(path), "-q", "--method", "identity", "--frame"]
     out = ["--out", str(tmp_path / "out")]
-    assert main([*command, "base_link", *out]) == 0
+    assert (
+        main([*(word for word in command if word != "-q"), "base_link", *out]) == 0
+    )
+    assert "path of" in capsys.readouterr().out
     said = refused(path, frame="map")
     assert "--frame map" in said and "'color'" in said and "base_link" in said
     assert main([*command, "map", "--out", str(tmp_path / "no")]) == 2
