@@ -81,6 +81,39 @@ def test_the_offset_of_the_clocks_is_found(late_ms: int) -> None:
         assert f"pass --depth-lag-ms {sign}{ms}" in answer.message
 
 
+@pytest.mark.parametrize("late_ms", [100, -67, 47])
+def test_maps_are_matched_anew_by_whole_frames(
+    late_ms: int, tmp_path: Path
+) -> None:
+    """What is less than most of a frame stays: it is one lag for all."""
+    root = tmp_path / "rgbd_dataset_freiburg3_swinging"
+    rows: dict[str, list[str]] = {"rgb": [], "depth": []}
+    for name in rows:
+        (root / name).mkdir(parents=True)
+    for i, frame in enumerate(swinging(0.0).frames):
+        cv2.imwrite(str(root / "rgb" / f"{i}.png"), frame.rgb[..., ::-1])
+        units = np.round(5000 * frame.depth).astype(np.uint16)
+        cv2.imwrite(str(root / "depth" / f"{i}.png"), units)
+        rows["rgb"].append(f"{frame.timestamp + 5:.6f} rgb/{i}.png\n")
+        late = frame.timestamp + 5 + late_ms / 1000
+        rows["depth"].append(f"{late:.6f} depth/{i}.png\n")
+    for name, lines in rows.items():
+        (root / f"{name}.txt").write_text("".join(lines))
+    sequence = open_sequence(root, camera="150,150,79.5,59.5")
+    answer = one_clock(sequence, pairs=60)
+    assert answer.differs and answer.option is not None
+    option, value = answer.option
+    whole = {100: 100, -67: -67, 47: 33}[late_ms]
+    assert option == "--depth-offset-ms" and int(value) == pytest.approx(
+        whole, abs=1
+    )
+    again = open_sequence(
+        root, camera="150,150,79.5,59.5", depth_offset_ms=float(value)
+    )
+    left = one_clock(again, pairs=60)
+    assert left.option is None or left.option[0] == "--depth-lag-ms"
+
+
 def test_stamps_of_depth_of_its_own_are_used() -> None:
     """Depth is 47 ms older than its image, and its stamps say so."""
     captured = swinging(0.047)
