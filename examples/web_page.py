@@ -27,7 +27,7 @@ def motion_of(prev, curr, prev_depth, curr_depth, focal_px, unit_m):
         raise hvo.InputError("two images and a depth file for each are needed.")
     height, width = prev.shape[:2]
     middle = (width - 1) / 2, (height - 1) / 2
-    camera = hvo.Camera(focal_px, focal_px, *middle, height, width)
+    camera = hvo.Camera(focal_px, focal_px, *middle, height=height, width=width)
     before = hvo.Frame(prev, read_depth(prev_depth) * np.float32(unit_m), camera)
     after = hvo.Frame(curr, read_depth(curr_depth) * np.float32(unit_m), camera)
     motion = hvo.estimate(before, after)

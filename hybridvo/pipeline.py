@@ -185,7 +185,10 @@ def by_depth(evidence: PairEvidence) -> Motion | None:
     depth = follow_depth(pair, expected, weights, evidence.options.refine)
     if depth is None:
         return None
-    text = "an image is dark or covered: the depth maps carry the motion"
+    cause = (
+        "an image is dark or covered" if pair.has_images else "an image is missing"
+    )
+    text = f"{cause}: the depth maps carry the motion"
     terms: tuple[Term, ...] = (Term.DEPTH,)
     if depth.rests_on(expected):
         text = f"{text}, and what was expected where they leave it open"

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import os
 import signal
+import socket
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -58,6 +61,30 @@ def open_many() -> None:
     raise AssertionError(len(files))
 
 
+def connect() -> None:
+    socket.socket().connect(("127.0.0.1", 9))
+
+
+def run_program() -> None:
+    os.execv("/bin/true", ["true"])
+
+
+def take_over() -> None:
+    """Read the memory of the process of the run, which has the rights of the child."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    attach = 16
+    if libc.ptrace(attach, os.getppid(), 0, 0) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def thread() -> None:
+    """Decoders of video have threads."""
+    worker = threading.Thread(target=lambda: None)
+    worker.start()
+    worker.join()
+
+
 def end() -> None:
     os._exit(0)
 
@@ -73,7 +100,7 @@ DEEDS: dict[str, Callable[[], None]] = {
     each.__name__: each
     for each in (
         *(take_memory, take_memory_and_hide_it, compute, wait, crash, fail),
-        *(write, open_many, end, map_file),
+        *(write, open_many, end, map_file, connect, run_program, take_over, thread),
     )
 }
 
@@ -89,7 +116,7 @@ class EvilSequence(StreamSequence):
         if "early" in self.chosen:
             DEEDS[self.chosen["deed"]]()
         self.timestamps = np.arange(FRAMES) / 30
-        self._camera = Camera(40, 40, 15.5, 11.5, 24, 32)
+        self._camera = Camera(40, 40, 15.5, 11.5, height=24, width=32)
 
     def _images(self, index: int) -> FrameImages:
         if index == BAD:

@@ -121,7 +121,7 @@ def test_ned_is_x_forward_y_right_z_down():
 
 def test_pixel_zero_is_a_centre():
     # a picture of 4x2 pixels reaches from -0.5 to 3.5 and to 1.5: its middle is (1.5, 0.5)
-    camera = Camera(10, 10, 1.5, 0.5, 2, 4)
+    camera = Camera(10, 10, 1.5, 0.5, height=2, width=4)
     grid = pixel_grid(2, 4)
     np.testing.assert_array_equal(grid[0, 0], [0, 0])
     np.testing.assert_array_equal(grid[1, 3], [3, 1])
@@ -135,13 +135,17 @@ def test_pixel_zero_is_a_centre():
 
 def test_resizing_keeps_the_borders_where_they_are():
     # 640x480 with the middle at 319.5, 239.5 -> 320x240: 0.5 (319.5 + 0.5) - 0.5 = 159.5
-    half = resize_camera(Camera(525, 520, 319.5, 239.5, 480, 640), 240, 320)
+    half = resize_camera(
+        Camera(525, 520, 319.5, 239.5, height=480, width=640), 240, 320
+    )
     assert (half.fx, half.fy, half.cx, half.cy) == (262.5, 260, 159.5, 119.5)
     # off the middle, a quarter: 0.25 (9.5 + 0.5) - 0.5 = 2; corner-aligned it would be 9.5 * 4 / 19
-    quarter = resize_camera(Camera(20, 20, 9.5, 3.5, 12, 20), 3, 5)
+    quarter = resize_camera(Camera(20, 20, 9.5, 3.5, height=12, width=20), 3, 5)
     assert (quarter.cx, quarter.cy) == (2.0, 0.5)
     # Sintel to the paper's size: 436 rows, 217.5 -> 128 / 436 * 218 - 0.5 = 63.5
-    sintel = resize_camera(Camera(1120, 1120, 511.5, 217.5, 436, 1024), 128, 256)
+    sintel = resize_camera(
+        Camera(1120, 1120, 511.5, 217.5, height=436, width=1024), 128, 256
+    )
     assert sintel.cx == 127.5
     assert sintel.cy == pytest.approx(63.5, abs=1e-12)
 
@@ -185,7 +189,7 @@ def test_tartanair_principal_point_is_the_middle_pixel_edge(tmp_path):
 
 def test_depth_is_z_and_not_the_distance():
     # the point (3, 0, 4) is 5 m away; its depth is 4. At f = 100 it is seen 75 px off the centre
-    camera = Camera(100, 100, 0, 0, 1, 76)
+    camera = Camera(100, 100, 0, 0, height=1, width=76)
     points = backproject(np.full((1, 76), 4.0), camera)
     np.testing.assert_allclose(points[0, 75], [3, 0, 4])
     assert np.linalg.norm(points[0, 75]) == pytest.approx(5)
@@ -226,11 +230,11 @@ def test_flow_leads_from_previous_to_current_x_first():
 
 def test_each_frame_has_its_own_intrinsics():
     # no motion, the lens zooms from 100 to 110: 40 px off the centre become 44
-    zoomed = Camera(110, 110, 50, 40, 81, 101)
+    zoomed = Camera(110, 110, 50, 40, height=81, width=101)
     flow = ego_flow(constant_depth(7), np.eye(4), CAMERA, zoomed)
     np.testing.assert_allclose(flow[40, 90], [4, 0], atol=1e-12)
     np.testing.assert_allclose(flow[40, 10], [-4, 0], atol=1e-12)
-    other = Camera(100, 100, 53, 38, 81, 101)
+    other = Camera(100, 100, 53, 38, height=81, width=101)
     moved = ego_flow(constant_depth(7), np.eye(4), CAMERA, other)
     np.testing.assert_allclose(moved[12, 34], [3, -2], atol=1e-12)
 
@@ -303,7 +307,7 @@ def test_covariance_of_the_estimate_is_of_a_left_translation_first_tangent():
     # depth is known and far (100 m): a pixel is worth 1 m sideways but 0.01 rad, so the first three
     # variances (m^2) are larger than the last three (rad^2)
     height, width = 48, 64
-    camera = Camera(100, 100, 31.5, 23.5, height, width)
+    camera = Camera(100, 100, 31.5, 23.5, height=height, width=width)
     grid = pixel_grid(height, width)
     depth = (100 + 40 * np.sin(grid[..., 0] / 3) * np.cos(grid[..., 1] / 4)).astype(
         np.float32

@@ -36,7 +36,9 @@ def write_walk(
 
     Beyond ``distinct`` frames the files are hard links to the first ones.
     """
-    camera = Camera(width, width, (width - 1) / 2, (height - 1) / 2, height, width)
+    camera = Camera(
+        width, width, (width - 1) / 2, (height - 1) / 2, height=height, width=width
+    )
     kinds = {"depth": "npy", "flow": "npy"} | ({"rgb": "png"} if pictures else {})
     for kind in kinds:
         (root / kind).mkdir(parents=True, exist_ok=True)

@@ -37,7 +37,9 @@ def camera(size: tuple[int, int] = SIZE, focal: float | None = None) -> Camera:
     """A camera whose focal length is the image width, centred."""
     height, width = size
     f = float(width) if focal is None else focal
-    return Camera(f, f, (width - 1) / 2, (height - 1) / 2, height, width)
+    return Camera(
+        f, f, (width - 1) / 2, (height - 1) / 2, height=height, width=width
+    )
 
 
 def another_camera(first: Camera) -> Camera:

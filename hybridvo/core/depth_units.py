@@ -95,6 +95,39 @@ def depth_unit_fix(median: float, usual: float | None = None) -> str:
     return f"divide by {unit} ({UNITS_PER_METRE[unit]})"
 
 
+def depth_by_units(stored: np.ndarray) -> str:
+    """Return the median of a depth map in metres, by each unit in use; empty without depth.
+
+    Args:
+        stored: depths of any shape, as they are stored.
+
+    Returns:
+        A sentence from which people see which unit it is.
+
+    >>> depth_by_units(np.full((9, 9), 900, np.uint16))
+    'Its median is 0.9 m by 1000, 0.18 m by 5000, 9 m by 100, 3.52 m by 256'
+    """
+    median = typical_depth(stored[::STRIDE, ::STRIDE].astype(np.float64))
+    if median is None:
+        return ""
+    shown = [f"{median / unit:.3g} m by {unit}" for unit in UNITS_PER_METRE]
+    return f"Its median is {', '.join(shown)}"
+
+
+def scale_is_unknown(stored: np.ndarray, expected: str) -> str:
+    """Return what is wrong with depth of whole numbers without a unit, for a message.
+
+    Args:
+        stored: a depth map.
+        expected: where the unit could be stated, beside the option.
+    """
+    by_units = depth_by_units(stored)
+    return (
+        f"depth is of whole numbers: expected {expected}, or --depth-scale: units per metre, 1000 "
+        f"for mm.{' ' if by_units else ''}{by_units}{'.' if by_units else ''}"
+    )
+
+
 def _everyday_unit(median: float) -> int:
     """The most frequent unit in which this median is an everyday depth."""
     near, far = EVERYDAY_DEPTH_M

@@ -11,14 +11,16 @@ from collections.abc import Iterable, Iterator
 MAX_MESSAGE_LENGTH = 2000
 
 
-def printable(text: str, keep: str = "\n\t") -> str:
-    r"""Return a text that is safe to print on a terminal.
+def printable(text: str, keep: str = "") -> str:
+    r"""Return a text that is safe to print on a terminal, on one line.
 
-    The names of files may hold control characters and bytes that are not UTF-8.
+    The names of files may hold control characters, such as the end of a line, after which a
+    name could forge a message of its own, and bytes that are not UTF-8.
 
     Args:
         text: Any text, such as a name or a message.
-        keep: Characters that stay as they are although they cannot be printed.
+        keep: Characters that stay as they are although they cannot be printed, such as the ends of
+            the lines of a traceback.
 
     Returns:
         The text with escapes such as ``\x1b`` in place of control characters (C0
@@ -89,7 +91,7 @@ def _escaped(character: str) -> str:
 class HybridVOError(Exception):
     """Base class of everything that hybridvo raises on purpose.
 
-    Its text can be printed on a terminal, whatever the names and values in it.
+    Its text can be printed on a terminal, and is one line, whatever the names and values in it.
 
     Attributes:
         exit_code: of a command that ends with it.

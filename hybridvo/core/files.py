@@ -216,7 +216,11 @@ class Journal:
             text = line[prefix_length:-1].decode("ascii", "replace")
             if line != self._next_line(text).encode():
                 raise FormatError(f"{path}:{number}: damaged, or of another run.")
-            self.values.append(json.loads(text))
+            try:
+                self.values.append(json.loads(text))
+            # thousands of brackets, or no JSON although its checksum is right
+            except (ValueError, RecursionError):
+                raise FormatError(f"{path}:{number}: expected JSON.") from None
         return len(content) - len(cut_off)
 
 

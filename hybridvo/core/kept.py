@@ -24,7 +24,7 @@ class kept_with(Generic[Owner, Kept]):
     ... def rows(frame):
     ...     print("computed")
     ...     return frame.camera.height
-    >>> frame = Frame(None, None, Camera(10, 10, 3.5, 2.5, 6, 8))
+    >>> frame = Frame(None, None, Camera(10, 10, 3.5, 2.5, height=6, width=8))
     >>> rows(frame), rows(frame)
     computed
     (6, 6)

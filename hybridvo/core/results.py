@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -22,6 +22,9 @@ IDENTITY_STD = (1.0, 0.3)
 
 UNINFORMATIVE_COVARIANCE = np.diag([1e4, 1e4, 1e4, 10.0, 10.0, 10.0])
 """Covariance that carries no information, m^2 and rad^2."""
+
+WEIGHT_STEPS = 255
+"""Steps from 0 to 1 of the weights that a step keeps: a byte."""
 
 
 class State(enum.Enum):
@@ -350,7 +353,8 @@ class RelativePose(Motion):
         residual_scale_px: standard deviation of the flow at a pixel of typical
             variance, px.
         depth_noise: standard deviation of log depth at such a pixel.
-        weights: (H, W) float32 robust weight of each pixel, or None.
+        weights: (H, W) float32 robust weight of each pixel, or None. Those of a step are kept to
+            within 1/510.
         evidence: the numbers from which the probability is computed, if any. Their type says
             what they are, see :mod:`hybridvo.judge.probability`.
         hypotheses: every strong motion that was found, the selected one first.
@@ -405,16 +409,53 @@ class RelativePose(Motion):
         )
 
     def __repr__(self) -> str:
+        return f"RelativePose({self.method or 'motion'}: {self._text()})"
+
+    def _text(self) -> str:
+        """The motion in words."""
         std_m, std_rad = stated_stds(self.covariance)
         std_deg = np.rad2deg(std_rad)
         x, y, z = self.T_curr_prev[:3, 3]
         degrees = np.rad2deg(rotation_angle(self.T_curr_prev[:3, :3]))
         return (
-            f"RelativePose({self.method or 'motion'}: {self.status}, "
-            f"t [{x:.4f} {y:.4f} {z:.4f}] +- {std_m:.3g} m, "
-            f"{degrees:.3f} +- {std_deg:.3g} deg, "
-            f"probability {self.probability:.2f})"
+            f"{self.status}, t [{x:.4f} {y:.4f} {z:.4f}] +- {std_m:.3g} m, "
+            f"{degrees:.3f} +- {std_deg:.3g} deg, probability {self.probability:.2f}"
         )
+
+
+class StepMotion(RelativePose):
+    """The motion of a step: its weights take a byte a pixel, since users keep all steps of a run.
+
+    ``weights`` are made of these bytes when they are asked for, to within 1/510.
+
+    Example:
+        >>> import pickle
+        >>> motion = RelativePose(weights=np.full((480, 640), 0.25, np.float32))
+        >>> kept = StepMotion.of(motion)
+        >>> kept.weights.shape, kept.weights.dtype.name, round(float(kept.weights[0, 0]), 2)
+        ((480, 640), 'float32', 0.25)
+        >>> len(pickle.dumps(kept)) < 310_000 < len(pickle.dumps(motion))
+        True
+    """
+
+    @classmethod
+    def of(cls, motion: RelativePose) -> StepMotion:
+        """Return a motion as a step keeps it."""
+        return cls(
+            **{each.name: getattr(motion, each.name) for each in fields(motion)}
+        )
+
+    @property
+    def weights(self) -> np.ndarray | None:
+        """(H, W) float32 robust weight of each pixel, or None; a copy."""
+        stored: np.ndarray | None = vars(self)["weight_bytes"]
+        return None if stored is None else stored / np.float32(WEIGHT_STEPS)
+
+    @weights.setter
+    def weights(self, value: np.ndarray | None) -> None:
+        if value is not None:
+            value = np.rint(WEIGHT_STEPS * np.clip(value, 0, 1)).astype(np.uint8)
+        vars(self)["weight_bytes"] = value
 
 
 @dataclass(frozen=True, eq=False)
@@ -524,9 +565,11 @@ class Step:
         corrected: the step before, once more, with ``track.lag``; the pose of this one goes on
             from there. None where that step stays as it was.
 
-    >>> step = Step(1, 0.1, np.eye(4), RelativePose(), prev_index=0)
+    >>> step = Step(1, 0.1, np.eye(4), RelativePose(covariance=1e-6 * np.eye(6)), prev_index=0)
     >>> step.ok, step.T_prev_curr.shape
     (True, (4, 4))
+    >>> print(step)  # doctest: +ELLIPSIS
+    Step(1 from 0, 0.1 s, at [0.0000 0.0000 0.0000] m: ok, t [0.0000 ...
     """
 
     index: int
@@ -540,6 +583,17 @@ class Step:
     gravity: Gravity | None = None
     measured: Edge | None = None
     corrected: Step | None = None
+
+    def __repr__(self) -> str:
+        start = "first" if self.prev_index is None else f"from {self.prev_index}"
+        x, y, z = self.T_world_cam[:3, 3]
+        place = f"at [{x:.4f} {y:.4f} {z:.4f}] m"
+        count = len(self.objects)
+        objects = f", {count} object{'s' if count > 1 else ''}" if count else ""
+        return (
+            f"Step({self.index} {start}, {self.timestamp:.6g} s, {place}: "
+            f"{self.motion._text()}{objects})"
+        )
 
     @property
     def edge(self) -> Edge | None:

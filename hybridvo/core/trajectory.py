@@ -12,7 +12,7 @@ import scipy
 from hybridvo.core.checks import as_rigid, rotation_error, to_numpy
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.files import Rows, atomic_write, read_rows
-from hybridvo.core.geometry import ned_to_camera
+from hybridvo.core.geometry import invert, ned_to_camera
 
 COLUMNS = {
     "tum": "timestamp tx ty tz qx qy qz qw",
@@ -81,6 +81,12 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def __repr__(self) -> str:
+        first, last = self.timestamps[[0, -1]]
+        steps = np.diff(self.positions, axis=0)
+        length = float(np.linalg.norm(steps, axis=1).sum())
+        return f"Trajectory({len(self)} poses, {first:.6f} to {last:.6f} s, {length:.3g} m long)"
+
     @property
     def positions(self) -> np.ndarray:
         """The camera centres in the world frame, (N, 3), metres."""
@@ -100,6 +106,52 @@ class Trajectory:
         """
         T = as_rigid(T_new_world, "T_new_world") @ self.T_world_cam
         return Trajectory(self.timestamps, T, self.has_timestamps, self.warnings)
+
+    def of_frame(self, T_cam_frame: np.ndarray) -> Trajectory:
+        """Return the path of another frame that is fixed to the camera, such as the robot's base.
+
+        Args:
+            T_cam_frame: (4, 4) points of that frame to the camera, metres.
+
+        Returns:
+            The path, with the same timestamps. Its world is related to that frame as the world
+            before was to the camera: a path that began at the identity does so again.
+
+        Raises:
+            InputError: for a matrix that is not rigid.
+
+        Example:
+            >>> turn = np.diag([-1.0, 1.0, -1.0, 1.0])  # about the camera's y axis
+            >>> path = Trajectory(np.array([0.0, 0.1]), np.stack([np.eye(4), turn]))
+            >>> behind = np.eye(4)
+            >>> behind[2, 3] = -0.3
+            >>> path.of_frame(behind).positions[1].tolist()
+            [0.0, 0.0, 0.6]
+        """
+        T = as_rigid(T_cam_frame, "T_cam_frame")
+        poses = invert(T) @ self.T_world_cam @ T
+        return Trajectory(
+            self.timestamps, poses, self.has_timestamps, self.warnings
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Trajectory:
+        """Read a text file of poses: TUM's, KITTI's or TartanAir's form, see :meth:`save`.
+
+        Args:
+            path: the file.
+
+        Returns:
+            The path. Stamps are in seconds; without any, frames are numbered.
+
+        Raises:
+            InputError: where there is no such file.
+            FormatError: names the line that does not fit.
+
+        Example:
+            >>> Trajectory.load("runs/mine/trajectory.tum").positions  # doctest: +SKIP
+        """
+        return read_trajectory(path)
 
     def save(self, path: str | Path) -> None:
         """Write a file in KITTI's form if its name ends in ``.kitti``, else TUM's.

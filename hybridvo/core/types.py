@@ -8,7 +8,7 @@ y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. Tangent vec
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +73,8 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    # width comes first in other libraries: nobody has to remember it
+    _: KW_ONLY
     height: int
     width: int
     readout_ms: float = 0.0
@@ -230,6 +232,26 @@ def _integer_depth_remedy(depth: np.ndarray) -> str:
     )
 
 
+def _size_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
+    """What to do with an image of another height and width than the camera's."""
+    height, width = array.shape[:2]
+    if (height, width) == (camera.width, camera.height):
+        return (
+            f"Height and width are exchanged: is it Camera(height={height}, width={width})? Of an "
+            f"image that was turned, take the camera that was turned with it; to transpose it "
+            f"would mirror it"
+        )
+    if name in ("depth", "depth_variance"):
+        return (
+            "Depth must be registered to the image, not resized: let the camera's driver do it, or "
+            "hybridvo.io.data.registration.register_depth"
+        )
+    return (
+        "Give the camera of images of this size; hybridvo.io.data.resize.resize_camera makes it of "
+        "one for larger images that were reduced"
+    )
+
+
 def _shape_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
     """What to do with an image whose shape is not the one expected."""
     height, width = camera.shape
@@ -250,11 +272,11 @@ def _shape_remedy(name: str, array: np.ndarray, camera: Camera) -> str:
             "Resize it to the image's size and scale its values, u by the widths' ratio "
             "and v by the heights'"
         )
-    if array.shape == (width, height, *array.shape[2:]):
-        return "Height and width are exchanged: transpose it"
     if array.shape[:2] == (height, width):
         return "Its height and width fit, its number of channels does not"
-    return "Resize with hybridvo.resize_frame, which also scales the camera"
+    if array.ndim not in (2, 3):
+        return "Hand in one image, without a batch"
+    return _size_remedy(name, array, camera)
 
 
 def _check_image(
@@ -299,6 +321,10 @@ def _check_image(
     object.__setattr__(owner, name, array)
 
 
+REPR_STRIDE = 4
+"""Of the rows and columns of depth that the text of a frame is made of."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One RGB-D frame, checked against its camera.
@@ -340,6 +366,28 @@ class Frame:
     mask: np.ndarray | None = None
     depth_source: str = "unknown"
     depth_scale: float = 1.0
+
+    def __repr__(self) -> str:
+        parts = [
+            "without image" if self.rgb is None else "image",
+            self._depth_text(),
+        ]
+        if self.mask is not None:
+            parts.append("mask")
+        number = "" if self.index is None else f"{self.index}, "
+        size = f"{self.camera.width}x{self.camera.height}"
+        return f"Frame({number}{self.timestamp:.6g} s, {size}: {', '.join(parts)})"
+
+    def _depth_text(self) -> str:
+        """How much depth there is, and how far it reaches, in words."""
+        if self.depth is None:
+            return "without depth"
+        shown = self.depth[::REPR_STRIDE, ::REPR_STRIDE]
+        median = typical_depth(shown)
+        if median is None:
+            return "no valid depth"
+        valid = np.mean(np.isfinite(shown) & (shown > 0))
+        return f"depth on {100 * valid:.0f} %, median {median:.3g} m"
 
     def __post_init__(self) -> None:
         check_kind("Frame.camera", self.camera, Camera)
@@ -410,6 +458,10 @@ class FramePair:
     flow_source: str = "unknown"
     flow_is_true: bool = False
     depth_source: str = "unknown"
+
+    def __repr__(self) -> str:
+        flow = "without flow" if self.flow is None else f"flow: {self.flow_source}"
+        return f"FramePair({self.prev!r}, {self.curr!r}, {flow})"
 
     def __post_init__(self) -> None:
         check_kind("FramePair.prev", self.prev, Frame)
@@ -560,8 +612,10 @@ class PairBatch:
     ...     K_prev=torch.tensor([[80.0, 0, 39.5], [0, 80, 29.5], [0, 0, 1]]).repeat(2, 1, 1),
     ...     K_curr=torch.tensor([[80.0, 0, 39.5], [0, 80, 29.5], [0, 0, 1]]).repeat(2, 1, 1),
     ... )
-    >>> len(batch.flow)
-    2
+    >>> batch
+    PairBatch(2 pairs of 80x60, torch.float32, cpu)
+    >>> len(batch), len(batch[1:]), batch.to("cpu", torch.float64).flow.dtype
+    (2, 1, torch.float64)
     """
 
     flow: torch.Tensor
@@ -598,6 +652,71 @@ class PairBatch:
             )
         for name in ("K_prev", "K_curr"):
             _check_intrinsics(getattr(self, name), f"PairBatch.{name}", self.flow)
+
+    def __len__(self) -> int:
+        return len(self.flow)
+
+    def __repr__(self) -> str:
+        _, height, width, _ = self.flow.shape
+        about = f"{width}x{height}, {self.flow.dtype}, {self.flow.device}"
+        return f"PairBatch({len(self)} pairs of {about})"
+
+    def __getitem__(self, samples: slice | list[int] | torch.Tensor) -> PairBatch:
+        """Return some of the pairs, through which gradients flow as well.
+
+        Args:
+            samples: A slice, numbers, or a mask (B,) bool.
+
+        Returns:
+            A batch of at least one pair.
+
+        Raises:
+            InputError: They name no pair, or one that is not there.
+
+        Example:
+            >>> later = batch[2:]  # doctest: +SKIP
+        """
+        if isinstance(samples, int):
+            last = f"{samples}:{samples + 1}" if samples != -1 else "-1:"
+            raise InputError(
+                f"PairBatch[{samples}]: expected a slice, numbers or a mask, got one number: a "
+                f"batch of one pair is batch[{last}]."
+            )
+        try:
+            return self._with(lambda value: value[samples])
+        except (IndexError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise InputError(
+                f"PairBatch[{str(samples)[:80]}]: expected pairs of 0 to {len(self) - 1}: {reason}"
+            ) from None
+
+    def to(
+        self,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> PairBatch:
+        """Return the batch on another device, or in another type of floating-point numbers.
+
+        Args:
+            device: as ``cuda``; None: where it is.
+            dtype: of the floating-point tensors; images and masks keep theirs. None: as it is.
+
+        Returns:
+            The batch; gradients flow through it.
+
+        Example:
+            >>> batch = batch.to("cuda")  # doctest: +SKIP
+        """
+
+        def moved(value: torch.Tensor) -> torch.Tensor:
+            return value.to(device, dtype if value.is_floating_point() else None)
+
+        return self._with(moved)
+
+    def _with(self, change: Callable[[torch.Tensor], torch.Tensor]) -> PairBatch:
+        """The batch with every tensor changed in one way."""
+        present = {name: v for name, v in vars(self).items() if v is not None}
+        return PairBatch(**{name: change(value) for name, value in present.items()})
 
     @classmethod
     def from_pairs(
@@ -680,7 +799,9 @@ class PairBatch:
         def camera(name: str, k: int) -> Camera:
             K = np.asarray(arrays[name])[k].astype(float)
             height, width = self.depth_prev.shape[1:]
-            return Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], height, width)
+            return Camera(
+                K[0, 0], K[1, 1], K[0, 2], K[1, 2], height=height, width=width
+            )
 
         pairs = []
         for k in range(len(self.flow)):

@@ -117,7 +117,8 @@ def levels_of(camera: Camera) -> tuple[Level, ...]:
     """The levels of a camera, the most accurate first.
 
     Example:
-        >>> [level.divisor for level in levels_of(Camera(500, 500, 319, 239, 480, 640))]
+        >>> camera = Camera(500, 500, 319, 239, height=480, width=640)
+        >>> [level.divisor for level in levels_of(camera)]
         [1, 2, 3]
     """
     divisors = [

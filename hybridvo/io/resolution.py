@@ -25,7 +25,7 @@ def resolution_question(camera: Camera) -> str:
     Args:
         camera: as it was given.
 
-    >>> resolution_question(Camera(1034.0, 1034.0, 637.0, 510.0, 480, 640))
+    >>> resolution_question(Camera(1034.0, 1034.0, 637.0, 510.0, height=480, width=640))
     'the principal point (637, 510) is not near the centre of images of 640x480 pixels: are the \
 intrinsics for 1280x960? Then scale them; or are the images cropped?'
     """

@@ -368,7 +368,7 @@ def box_of(mask: np.ndarray, margin: int) -> Box:
 def widened(box: Box, camera: Camera) -> Box:
     """The box, wide enough that its camera's centre lies no farther outside than it is large.
 
-    >>> camera = Camera(300, 300, 159.5, 119.5, 240, 320)
+    >>> camera = Camera(300, 300, 159.5, 119.5, height=240, width=320)
     >>> widened(Box(100, 280, 140, 320), camera)
     Box(top=100, left=239, bottom=140, right=320)
     """
@@ -382,7 +382,7 @@ def widened(box: Box, camera: Camera) -> Box:
 def with_centre(box: Box, camera: Camera) -> Box:
     """The box, grown to the camera's centre: so every part of it can be widened inside of it.
 
-    >>> camera = Camera(300, 300, 159.5, 119.5, 240, 320)
+    >>> camera = Camera(300, 300, 159.5, 119.5, height=240, width=320)
     >>> with_centre(Box(100, 280, 110, 320), camera)
     Box(top=100, left=159, bottom=120, right=320)
     """

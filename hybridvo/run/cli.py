@@ -124,7 +124,7 @@ def _say(text: str) -> None:
 
 def _say_traceback() -> None:
     """Print on stderr where the current error came from."""
-    print(printable(traceback.format_exc()), end="", file=sys.stderr)
+    print(printable(traceback.format_exc(), keep="\n"), end="", file=sys.stderr)
 
 
 def _print_result(args: Namespace, content: Any) -> None:

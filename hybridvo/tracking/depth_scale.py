@@ -103,7 +103,7 @@ def divided(frame: Frame, scale: float) -> Frame:
 
     Example:
         >>> from hybridvo.core.types import Camera
-        >>> frame = Frame(None, np.full((1, 2), 3.0), Camera(1.0, 1.0, 0.0, 0.0, 1, 2))
+        >>> frame = Frame(None, np.full((1, 2), 3.0), Camera(1.0, 1.0, 0.0, 0.0, height=1, width=2))
         >>> halved = divided(frame, 2.0)
         >>> float(halved.depth[0, 0]), halved.depth_scale
         (1.5, 2.0)

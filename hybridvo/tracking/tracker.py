@@ -18,7 +18,13 @@ from hybridvo.core.errors import InputError
 from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import Options
-from hybridvo.core.results import MotionPrior, Reason, RelativePose, Step
+from hybridvo.core.results import (
+    MotionPrior,
+    Reason,
+    RelativePose,
+    Step,
+    StepMotion,
+)
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.core.unchecked import changed
@@ -79,6 +85,12 @@ class Tracker:
         provider = flow or dis_flow(self.options.flow.dis_preset)
         self._context = pipeline.Context(self.options, network, provider, self.seed)
         self.reset()
+
+    def __repr__(self) -> str:
+        x, y, z = self.state.T_world_last[:3, 3]
+        place = f"at [{x:.4f} {y:.4f} {z:.4f}] m"
+        frames = f"{self.state.count} frames"
+        return f"{type(self).__name__}({self.method}, {frames}, {place})"
 
     def reset(self) -> None:
         """Forget everything: the next frame is the first one, at the identity."""
@@ -201,7 +213,7 @@ class Tracker:
         step = self._finished(before, after, replace(step, gravity=after.gravity))
         # nothing has changed so far: a frame that fails leaves the tracker as it was
         self.state = after
-        return step
+        return replace(step, motion=StepMotion.of(step.motion))
 
     def _finished(
         self, before: TrackerState, after: TrackerState, step: Step
@@ -339,7 +351,12 @@ def warm_up(
     # the second takes the parallel kernels
     for height, width in ((48, 64), (320, 400)):
         camera = Camera(
-            width, width, (width - 1) / 2, (height - 1) / 2, height, width
+            width,
+            width,
+            (width - 1) / 2,
+            (height - 1) / 2,
+            height=height,
+            width=width,
         )
         u = np.arange(width)
         v = np.arange(height)[:, None]

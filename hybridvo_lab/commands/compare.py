@@ -237,7 +237,7 @@ def _refuse_results(out: Path) -> None:
     """Raise an InputError where a folder holds results of a comparison."""
     present = [name for name in (*WRITTEN, RUNS) if (out / name).exists()]
     if present:
-        choices = "--resume to go on, --overwrite to replace them, or another --out"
+        choices = "--resume to go on, another --out, or --overwrite to replace them"
         raise InputError(f"{out}: holds {', '.join(present)}; pass {choices}.")
 
 

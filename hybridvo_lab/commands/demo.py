@@ -115,7 +115,7 @@ def _check_folder(out: Path, overwrite: bool) -> None:
     if not present or (overwrite and is_demo):
         return
     choices = (
-        "--overwrite to replace what a demo has written alone, or another --out"
+        "another --out, or --overwrite to replace what a demo has written alone"
     )
     names = abbreviated(sorted(present))
     raise InputError(f"{out}: holds {names}; pass {choices}.")

@@ -97,7 +97,7 @@ def _check_arguments(
         raise InputError(f"{out}: expected a name that ends in .png.")
     if out.exists() and not overwrite:
         raise InputError(
-            f"{out}: exists; pass --overwrite, or another name as --out."
+            f"{out}: exists; pass another name as --out, or --overwrite."
         )
     if not 0 <= pair < len(sequence) - 1:
         raise InputError(

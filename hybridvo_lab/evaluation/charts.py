@@ -248,6 +248,8 @@ def factor_charts(scored: pd.DataFrame, methods: list[str]) -> list[Figure]:
         medians = medians.sort_values(name)
         if medians[name].nunique() > 1:
             medians[factor.label] = medians[name].astype(str)
+            # the line of the other charts: medians of groups have none of their own
+            medians["wrong_limit_px"] = _wrong_limit(scored)
             chart = _chart(
                 px.line,
                 medians,

@@ -89,7 +89,9 @@ def _window_of(camera: Camera, zoom: float) -> Camera:
     width = round(WINDOW * camera.width)
     fx = zoom * camera.fx
     fy = zoom * camera.fy
-    return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, height, width)
+    return Camera(
+        fx, fy, (width - 1) / 2, (height - 1) / 2, height=height, width=width
+    )
 
 
 def _turned(rotation: np.ndarray) -> np.ndarray:

@@ -147,7 +147,9 @@ def make_pair(
     conditions = SCENARIOS[scenario] if isinstance(scenario, str) else scenario
     rng = np.random.default_rng([zlib.crc32(name.encode()), int(seed)])
     focal = REFERENCE_FOCAL_PX * width / REFERENCE_WIDTH
-    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
+    camera = Camera(
+        focal, focal, (width - 1) / 2, (height - 1) / 2, height=height, width=width
+    )
     T = _draw_motion(rng, conditions)
 
     # geometry

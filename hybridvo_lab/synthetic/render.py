@@ -225,7 +225,12 @@ class Scene:
         u = width / full.width
         v = height / full.height
         return Camera(
-            u * full.fx, v * full.fy, u * full.cx, v * full.cy, height, width
+            u * full.fx,
+            v * full.fy,
+            u * full.cx,
+            v * full.cy,
+            height=height,
+            width=width,
         )
 
 

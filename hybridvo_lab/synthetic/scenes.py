@@ -504,7 +504,9 @@ def _draw_scene(
     focal = rng.uniform(1.0, 1.2) * width
     # not used, but without these draws the scene of every seed would be another one
     rng.random(2)
-    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
+    camera = Camera(
+        focal, focal, (width - 1) / 2, (height - 1) / 2, height=height, width=width
+    )
     view = np.array([width / 2, height / 2]) / focal
     path = _draw_path(rng, frames)
     room = tuple(_Room(rng, view).solids)

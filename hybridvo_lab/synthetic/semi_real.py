@@ -352,7 +352,9 @@ def _window(full: Camera) -> _Window:
     width = round(MARGIN * full.width)
     top = (full.height - height) // 2
     left = (full.width - width) // 2
-    camera = Camera(full.fx, full.fy, full.cx - left, full.cy - top, height, width)
+    camera = Camera(
+        full.fx, full.fy, full.cx - left, full.cy - top, height=height, width=width
+    )
     return _Window(camera, np.s_[top : top + height, left : left + width])
 
 

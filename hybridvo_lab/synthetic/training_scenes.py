@@ -335,7 +335,7 @@ def _draw_camera(rng: np.random.Generator, height: int, width: int) -> _CameraVi
     fx = width / 2 / tan_x
     fy = aspect * width / 2 / tan_x
     view = np.array([tan_x, tan_x * height / width / aspect])
-    return _CameraView(Camera(fx, fy, u, v, height, width), view)
+    return _CameraView(Camera(fx, fy, u, v, height=height, width=width), view)
 
 
 def _draw_camera_motion(rng: np.random.Generator, is_street: bool) -> np.ndarray:

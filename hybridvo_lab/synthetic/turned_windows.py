@@ -203,7 +203,9 @@ def _window_camera(rng: np.random.Generator, camera: Camera) -> Camera:
     zoom = rng.uniform(0.7, 1.05)
     fx = zoom * camera.fx
     fy = zoom * camera.fy
-    return Camera(fx, fy, (width - 1) / 2, (height - 1) / 2, height, width)
+    return Camera(
+        fx, fy, (width - 1) / 2, (height - 1) / 2, height=height, width=width
+    )
 
 
 def looking_at(pixel: np.ndarray, camera: Camera) -> np.ndarray:

@@ -233,8 +233,8 @@ def _in_one_camera(
         camera.fy,
         camera.cx - left,
         camera.cy - top,
-        int(bottom - top),
-        int(right - left),
+        height=int(bottom - top),
+        width=int(right - left),
     )
     window = np.s_[top:bottom, left:right]
     own = [_cropped(frame, window, cropped) for frame in scene.frames]

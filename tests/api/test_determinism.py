@@ -62,7 +62,7 @@ def test_the_first_motion_on_a_new_machine_is_that_of_every_later_one(
     code = (
         "import json, numpy as np, hybridvo as hvo; "
         "rng = np.random.default_rng(0); "
-        "K = hvo.Camera(90, 90, 79.5, 59.5, 120, 160); "
+        "K = hvo.Camera(90, 90, 79.5, 59.5, height=120, width=160); "
         "f = hvo.Frame(None, rng.uniform(2, 5, (120, 160)), K); "
         "flow = np.full((120, 160, 2), 1.5) + rng.normal(0, 0.3, (120, 160, 2)); "
         "print(json.dumps(hvo.refine(hvo.FramePair(f, f, flow)).T_curr_prev.tolist()))"

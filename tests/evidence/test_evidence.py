@@ -54,7 +54,7 @@ def priors_of(
     monkeypatch.setitem(pipeline.METHODS, "identity", pipeline.Method(recorder))
     options = hybridvo.Options(track=TrackOptions(motion_prior=motion_prior))
     vo = hybridvo.Odometry(method="identity", options=options)
-    camera = Camera(60, 60, 31.5, 23.5, 48, 64)
+    camera = Camera(60, 60, 31.5, 23.5, height=48, width=64)
     frame = Frame(
         np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera
     )

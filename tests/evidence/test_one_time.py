@@ -116,4 +116,6 @@ def test_the_first_motion_brings_the_first_depth_in_time() -> None:
 
 def test_a_lag_that_is_no_time_is_refused() -> None:
     with pytest.raises(hvo.InputError, match="depth_lag_ms"):
-        hvo.Camera(100, 100, 79.5, 59.5, 120, 160, depth_lag_ms=float("nan"))
+        hvo.Camera(
+            100, 100, 79.5, 59.5, height=120, width=160, depth_lag_ms=float("nan")
+        )

@@ -22,7 +22,7 @@ from hybridvo_lab.synthetic.scenes import make_scene
 
 HEIGHT, WIDTH = 96, 128
 BASE, FACTOR = DIS_NOISE
-CAMERA = Camera(100, 100, 63.5, 47.5, HEIGHT, WIDTH)
+CAMERA = Camera(100, 100, 63.5, 47.5, height=HEIGHT, width=WIDTH)
 
 
 def frame(rgb: np.ndarray | None, index: int = 0) -> Frame:
@@ -64,7 +64,7 @@ def test_a_missing_image_has_no_flow(rgb: np.ndarray | None) -> None:
 
 
 def test_images_smaller_than_a_patch_do_not_raise() -> None:
-    camera = Camera(5, 5, 1.5, 1.5, 4, 4)
+    camera = Camera(5, 5, 1.5, 1.5, height=4, width=4)
     small = Frame(np.zeros((4, 4, 3), np.uint8), None, camera)
     field = dis_flow()(small, small)
     assert field.flow is None or np.isfinite(field.flow).all()
@@ -238,7 +238,11 @@ def test_images_without_texture_contradict_nothing(texture: np.ndarray) -> None:
         assert (
             contradiction(replace(pair, curr=replace(pair.curr, rgb=rgb))) is None
         )
-    tiny = Frame(np.zeros((3, 4, 3), np.uint8), None, Camera(4, 4, 1.5, 1.0, 3, 4))
+    tiny = Frame(
+        np.zeros((3, 4, 3), np.uint8),
+        None,
+        Camera(4, 4, 1.5, 1.0, height=3, width=4),
+    )
     assert (
         contradiction(FramePair(tiny, tiny, np.zeros((3, 4, 2), np.float32)))
         is None

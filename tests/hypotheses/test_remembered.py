@@ -19,7 +19,7 @@ from hybridvo.hypotheses.types import HypothesisSet
 from hybridvo.solver.points import grid_index
 
 SIZE = (120, 160)
-CAMERA = Camera(160.0, 160.0, 79.5, 59.5, *SIZE)
+CAMERA = Camera(160.0, 160.0, 79.5, 59.5, height=SIZE[0], width=SIZE[1])
 MOTION = se3_exp(np.array([0.02, -0.01, 0.03, 0.004, 0.006, -0.002]))
 OTHER = se3_exp(np.array([-0.15, 0.05, 0.0, 0.0, 0.0, 0.03]))
 STATIC = np.zeros(SIZE, bool)

@@ -20,7 +20,7 @@ from hybridvo.hypotheses.types import Candidate, HypothesisSet, MotionSource
 from hybridvo.solver.pixels import PixelGrid
 
 IDENTITY = np.eye(4)[None]
-CAMERA = Camera(150.0, 150.0, 79.5, 47.5, 96, 160)
+CAMERA = Camera(150.0, 150.0, 79.5, 47.5, height=96, width=160)
 WORLD = se3_exp(np.array([0.05, -0.02, 0.1, 0.004, -0.01, 0.006]))
 OBJECT = se3_exp(np.array([-0.2, 0.05, 0.0, 0.02, 0.03, -0.01]))
 

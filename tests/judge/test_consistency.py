@@ -14,6 +14,9 @@ from hybridvo.core.geometry import invert, se3_log
 from hybridvo.core.results import Reason, RelativePose
 from hybridvo.evidence.pair import PairEvidence
 from hybridvo.judge.consistency import (
+    ByImages,
+    ImageMatch,
+    _against,
     against_images_and_depth,
     contradiction_by_depth,
 )
@@ -199,3 +202,21 @@ def test_what_the_images_disagree_with_a_flow_is_in_the_covariance(
     squared = error @ np.linalg.solve(answer.covariance, error)
     # 99.9 % of six numbers
     assert squared < chi2.ppf(0.999, 6)
+
+
+@pytest.mark.parametrize("in_view", [1.0, 0.0])
+def test_two_images_that_match_along_no_motion(
+    walk: list[hvo.Frame], in_view: float
+) -> None:
+    """They contradict the motion without another one to go to, where enough is in view."""
+    nowhere = ImageMatch(noise=50.0, correlation=0.05, in_view=in_view)
+    motion = RelativePose(np.eye(4), np.eye(6))
+    images = ByImages(np.eye(4), np.eye(6), nowhere, nowhere)
+    pair = with_given_flow(walk[0], walk[1], dis(walk[0], walk[1]))
+    found = _against(pair, motion, images, "given")
+    if in_view == 0:
+        assert found is None
+        return
+    assert found is not None
+    np.testing.assert_array_equal(found.T_curr_prev, np.eye(4))
+    assert "do not match" in found.message and "0.05" in found.message

@@ -14,7 +14,7 @@ from hybridvo.core.results import Reason
 from hybridvo.judge.false_depth import exact_surface
 from hybridvo_lab.synthetic.scenes import make_scene
 
-CAMERA = hvo.Camera(250.0, 250.0, 159.5, 119.5, 240, 320)
+CAMERA = hvo.Camera(250.0, 250.0, 159.5, 119.5, height=240, width=320)
 
 
 def constant(depth: np.ndarray) -> np.ndarray:

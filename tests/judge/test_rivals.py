@@ -57,7 +57,7 @@ def test_a_motion_that_is_not_ambiguous_has_no_rivals() -> None:
 
 
 def test_rivals_of_a_keyframe_start_from_the_frame_before_as_well() -> None:
-    camera = hvo.Camera(100.0, 100.0, 31.5, 23.5, 48, 64)
+    camera = hvo.Camera(100.0, 100.0, 31.5, 23.5, height=48, width=64)
     depth = np.full(camera.shape, 2.0, np.float32)
     frame = hvo.Frame(np.zeros((48, 64, 3), np.uint8), depth, camera)
     T_prev_key = se3_exp(np.array([0.1, 0, 0, 0, 0.1, 0]))

@@ -151,7 +151,7 @@ def test_what_was_expected_is_weighed_by_its_covariance() -> None:
 def textured_pair(T: np.ndarray, depth_m: float = 2.0) -> FramePair:
     """A textured wall seen from two places, without any flow to speak of."""
     rng = np.random.default_rng(0)
-    camera = Camera(120.0, 120.0, 79.5, 59.5, 120, 160)
+    camera = Camera(120.0, 120.0, 79.5, 59.5, height=120, width=160)
     wall = cv2.GaussianBlur(
         rng.uniform(0, 255, (360, 480)).astype(np.float32), (0, 0), 4
     )

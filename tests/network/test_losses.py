@@ -192,7 +192,10 @@ def test_a_coarse_scale_answers_for_its_pixels():
 @pytest.mark.parametrize("seed", range(3))
 def test_reconstruction_matches_the_numpy_geometry(seed):
     rng = np.random.default_rng(seed)
-    prev, curr = Camera(50, 55, 10, 7, 16, 24), Camera(52, 57, 11, 8, 16, 24)
+    prev, curr = (
+        Camera(50, 55, 10, 7, height=16, width=24),
+        Camera(52, 57, 11, 8, height=16, width=24),
+    )
     depth = rng.uniform(0.5, 10, (16, 24))
     depth[rng.random((16, 24)) < 0.1] = np.nan
     motion = make_transform(

@@ -17,7 +17,7 @@ from hybridvo_lab.paper.losses import LossOptions, LossTargets, total_loss
 from hybridvo_lab.paper.networks import NetworkOptions, build_network
 from hybridvo_lab.paper.normalization import normalize
 
-CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
+CAMERA = Camera(60.0, 62.0, 31.5, 15.5, height=32, width=64)
 SCALE_FREE = NetworkOptions(scale_free=True)
 MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
 

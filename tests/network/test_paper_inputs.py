@@ -11,7 +11,7 @@ from hybridvo.core.geometry import ego_flow, euler_deg_to_matrix, make_transform
 from hybridvo.core.types import Camera, Frame, FramePair, PairBatch
 from hybridvo_lab.paper.inputs import NetworkInputs, assemble_inputs
 
-CAMERA = Camera(20.0, 25.0, 3.5, 1.5, 4, 8)
+CAMERA = Camera(20.0, 25.0, 3.5, 1.5, height=4, width=8)
 
 
 def make_pair(
@@ -55,8 +55,8 @@ def test_values_at_native_size_by_hand():
 
 
 def test_a_rigid_scene_keeps_its_equation_after_resizing():
-    camera_prev = Camera(300, 300, 160, 110, 218, 320)
-    camera_curr = Camera(310, 310, 158, 108, 218, 320)
+    camera_prev = Camera(300, 300, 160, 110, height=218, width=320)
+    camera_curr = Camera(310, 310, 158, 108, height=218, width=320)
     v, u = np.mgrid[0:218, 0:320]
     depth = 4 + 0.005 * u + 0.003 * v
     T = make_transform(

@@ -58,7 +58,7 @@ def test_the_world_is_fitted_where_the_doubt_is_small(moving_pair) -> None:
         fitted_motion(PixelwisePrediction(torch.zeros(1, 6, 1, 1)), inputs)
 
 
-CAMERA = Camera(60.0, 62.0, 31.5, 15.5, 32, 64)
+CAMERA = Camera(60.0, 62.0, 31.5, 15.5, height=32, width=64)
 MOTION = se3_exp(np.array([0.05, -0.03, 0.08, 0.004, -0.006, 0.01]))
 DEPTH = np.linspace(2, 6, 64, dtype=np.float32) * np.ones((32, 1), np.float32)
 

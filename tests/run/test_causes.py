@@ -90,3 +90,11 @@ def test_the_delay_of_depth_is_that_of_its_stamps() -> None:
 
     assert depth_delay(Stamped(), 1) == pytest.approx(0.015)
     assert depth_delay(object(), 1) == 0.0
+
+
+def test_an_image_that_is_missing_is_neither_dark_nor_blurred() -> None:
+    no_flow = step(Status.degraded(Reason.NO_FLOW, "an image is missing"))
+    without = changed(rgb=None)
+    assert likely_cause(no_flow, PREV, without) == "no_image"
+    assert likely_cause(no_flow, without, CURR) == "no_image"
+    assert "missing" in CAUSES["no_image"]

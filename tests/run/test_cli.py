@@ -178,7 +178,7 @@ def test_names_do_not_steer_the_terminal(dataset, tmp_path, monkeypatch, capsys)
 
 def test_what_is_written_out_and_what_stays():
     harmless = "a\tb\né \N{GREEK SMALL LETTER SIGMA}"
-    assert printable(harmless) == harmless
+    assert printable(harmless, keep="\t\n") == harmless
     assert (
         printable("\x00\x07\x1b\x7f\x9b\udcff\u202e")
         == r"\x00\x07\x1b\x7f\x9b\udcff\u202e"

@@ -127,7 +127,7 @@ def test_what_cannot_be_written(bag: Path, tmp_path: Path, capsys) -> None:
 
 def test_a_camera_of_another_size_is_refused(bag: Path, tmp_path: Path) -> None:
     sequence = open_sequence(bag)
-    other = Camera(50.0, 50.0, 7.5, 5.5, 12, 16)
+    other = Camera(50.0, 50.0, 7.5, 5.5, height=12, width=16)
     first = sequence.camera(0)
     sequence.camera = lambda index: other if index else first
     frame = sequence.frame
@@ -144,7 +144,9 @@ def test_a_camera_that_focuses_anew_is_resampled(bag: Path, tmp_path: Path) -> N
     """Twice the focal length: a step of two pixels becomes one of one."""
     sequence = open_sequence(bag)
     first = sequence.camera(0)
-    zoomed = Camera(2 * first.fx, 2 * first.fy, first.cx, first.cy, 24, 32)
+    zoomed = Camera(
+        2 * first.fx, 2 * first.fy, first.cx, first.cy, height=24, width=32
+    )
     frame = sequence.frame
 
     def zoom(index: int) -> Frame:

@@ -29,7 +29,7 @@ from hybridvo.run.commands.doctor import diagnose_camera
 from hybridvo.tracking.camera_drift import Mean
 from hybridvo.tracking.passes import PixelTimes
 
-CAMERA = Camera(150.0, 150.0, 79.5, 59.5, 120, 160)
+CAMERA = Camera(150.0, 150.0, 79.5, 59.5, height=120, width=160)
 RATE = 30
 
 
@@ -77,8 +77,41 @@ def test_the_offset_of_the_clocks_is_found(late_ms: int) -> None:
     assert ms == pytest.approx(abs(late_ms), abs=4)
     assert std <= 5
     if late_ms:
-        expected = "subtract" if late_ms > 0 else "add"
-        assert f"{expected} {ms} ms" in answer.message
+        sign = "" if late_ms > 0 else "-"
+        assert f"pass --depth-lag-ms {sign}{ms}" in answer.message
+
+
+@pytest.mark.parametrize("late_ms", [100, -67, 47])
+def test_maps_are_matched_anew_by_whole_frames(
+    late_ms: int, tmp_path: Path
+) -> None:
+    """What is less than most of a frame stays: it is one lag for all."""
+    root = tmp_path / "rgbd_dataset_freiburg3_swinging"
+    rows: dict[str, list[str]] = {"rgb": [], "depth": []}
+    for name in rows:
+        (root / name).mkdir(parents=True)
+    for i, frame in enumerate(swinging(0.0).frames):
+        cv2.imwrite(str(root / "rgb" / f"{i}.png"), frame.rgb[..., ::-1])
+        units = np.round(5000 * frame.depth).astype(np.uint16)
+        cv2.imwrite(str(root / "depth" / f"{i}.png"), units)
+        rows["rgb"].append(f"{frame.timestamp + 5:.6f} rgb/{i}.png\n")
+        late = frame.timestamp + 5 + late_ms / 1000
+        rows["depth"].append(f"{late:.6f} depth/{i}.png\n")
+    for name, lines in rows.items():
+        (root / f"{name}.txt").write_text("".join(lines))
+    sequence = open_sequence(root, camera="150,150,79.5,59.5")
+    answer = one_clock(sequence, pairs=60)
+    assert answer.differs and answer.option is not None
+    option, value = answer.option
+    whole = {100: 100, -67: -67, 47: 33}[late_ms]
+    assert option == "--depth-offset-ms" and int(value) == pytest.approx(
+        whole, abs=1
+    )
+    again = open_sequence(
+        root, camera="150,150,79.5,59.5", depth_offset_ms=float(value)
+    )
+    left = one_clock(again, pairs=60)
+    assert left.option is None or left.option[0] == "--depth-lag-ms"
 
 
 def test_stamps_of_depth_of_its_own_are_used() -> None:
@@ -141,7 +174,14 @@ def test_depth_of_another_focal_length(shared_data: Path) -> None:
     for number in range(3, 36, 8):
         bgr = cv2.imread(str(folder / "rgb" / f"{number:06d}.jpg"))
         stored = cv2.imread(str(folder / "depth" / f"{number:06d}.png"), -1)
-        camera = Camera(534.3, 534.7, 308.6, 242.1, *stored.shape)
+        camera = Camera(
+            534.3,
+            534.7,
+            308.6,
+            242.1,
+            height=stored.shape[0],
+            width=stored.shape[1],
+        )
         rgb = np.ascontiguousarray(bgr[..., ::-1])
         frames.append(Frame(rgb, np.float32(stored / 1000), camera, number / 5))
     answer = zoomed_registration(Captured("unregistered", frames))
@@ -274,7 +314,7 @@ def test_the_doctor_looks_at_a_camera(monkeypatch, capsys) -> None:
     assert "turn it to and fro" in shown.err
     lines = shown.out.splitlines()
     clocks = next(line for line in lines if "clocks" in line)
-    assert clocks.startswith("DIFFERS") and "subtract 6" in clocks
+    assert clocks.startswith("DIFFERS") and "--depth-lag-ms 6" in clocks
     rate = next(line for line in lines if "rate of the camera" in line)
     assert "30 frames a second; 30 requested" in rate
 

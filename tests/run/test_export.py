@@ -179,7 +179,7 @@ def test_masks_by_hand() -> None:
     weights[::4, ::4] = 0
     weights[30:60, 20:60] = 0
     weights[:, 100:] = 0
-    camera = Camera(100.0, 100.0, 63.5, 47.5, 96, 128)
+    camera = Camera(100.0, 100.0, 63.5, 47.5, height=96, width=128)
     own = np.full((96, 128), True)
     own[:5] = False
     frame = Frame(None, depth, camera, mask=own)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import dataclasses
 import json
 import os
 import shutil
 import signal
+import tracemalloc
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,11 +20,14 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.core.files import Journal, checksum
+from hybridvo.core.geometry import se3_exp
 from hybridvo.core.results import RelativePose
 from hybridvo.core.trajectory import read_trajectory
+from hybridvo.io.data.sequence import Sequence
 from hybridvo.pipeline import METHODS, Method
 from hybridvo.run.cli import main
-from hybridvo.run.commands.run_folder import CHECKPOINT, STATE
+from hybridvo.run.commands.run_folder import CHECKPOINT, STATE, _deciding
 from hybridvo_lab.synthetic.scenes import make_scene
 
 FRAMES = 6
@@ -452,3 +458,123 @@ def test_a_pass_that_an_error_ends_is_an_interruption(own, tmp_path):
 def test_passes_need_flow_that_is_computed(dataset, tmp_path, capsys):
     assert run(dataset, tmp_path / "out", "--passes", "2", quiet=False) == 2
     assert "--flow dis" in capsys.readouterr().err
+
+
+# -- a folder that a stranger has made up --------------------------------------------------
+
+
+def packed(count: int, shape: list[int], dtype: str = "uint8") -> dict[str, Any]:
+    """An array of zeros in a journal, with any shape that it states."""
+    content = base64.b64encode(zlib.compress(bytes(count))).decode()
+    return {"packed": content, "shape": shape, "dtype": dtype}
+
+
+def forge(out: Path, row: Any, tracker: Any) -> None:
+    """Put another last frame into a journal, with checksums that are right."""
+    header = load(out, STATE)
+    seed = json.dumps(_deciding(header))
+    lines = (out / CHECKPOINT).read_text().splitlines()
+    (out / CHECKPOINT).unlink()
+    journal = Journal(out / CHECKPOINT, seed)
+    for line in lines[:-1]:
+        journal.add(json.loads(line)[1])
+    last_row, last_tracker = json.loads(lines[-1])[1]
+    chosen = [last_row if row is None else row, tracker or last_tracker]
+    journal.add(chosen)
+    journal.close()
+
+
+MANY = 200 * 2**20
+"""Bytes: more than a test of this kind may need."""
+FORGERIES: dict[str, tuple[Any, Any]] = {
+    "a bomb": (None, [packed(MANY, [10])]),
+    "an array of terabytes": (None, [packed(10, [2**40])]),
+    "many arrays": (None, [packed(0, [2**28]) for _ in range(4)]),
+    "no lengths": (None, [packed(10, [-2, -5])]),
+    "python objects": (None, [packed(800, [100], "O")]),
+    "no base64": (None, [{"packed": "?", "shape": [1], "dtype": "f8"}]),
+    "another class": (None, [{"state": "Popen", "args": "true"}, None]),
+    "no such field": (None, [{"state": "TrackerState", "colour": 1}, None]),
+    "one value": (None, [1]),
+    "a frame that is not there": (None, [{"frame": 10**9, "depth_scale": 1}, None]),
+    "fields of other types": (
+        None,
+        [{"state": "TrackerState", "keyframes": 7, "count": "many"}, None],
+    ),
+    "a row of nothing": ({}, None),
+    "a row that is a number": (7, None),
+}
+
+
+@pytest.fixture
+def stopped(dataset, tmp_path, monkeypatch) -> Path:
+    """A run of three frames that was interrupted."""
+    out = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        at_frame(3, lambda: signal.raise_signal(signal.SIGINT), patch)
+        assert run(dataset, out, "--flow", "dis", "--method", "identity") == 130
+    return out
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forged_run_is_refused_in_one_line(name, stopped, dataset, capsys):
+    forge(stopped, *FORGERIES[name])
+    capsys.readouterr()
+    tracemalloc.start()
+    options = ("--flow", "dis", "--method", "identity", "--resume")
+    code = run(dataset, stopped, *options)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    said = capsys.readouterr().err
+    assert code == 2, said
+    assert "Traceback" not in said and said.count("\n") == 1
+    assert "cannot be resumed" in said and "--out DIR" in said
+    assert peak < MANY / 2
+
+
+@pytest.mark.parametrize(
+    "summary",
+    [
+        *(None, 5, []),
+        *({"files": 3}, {"files": [["x"]]}, {"failed_fraction": "none"}),
+        *({"least_sure": 7}, {"metrics": 7}, {"frames": None, "flow_source": None}),
+    ],
+)
+def test_a_forged_summary_is_refused_in_one_line(
+    summary, dataset, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    options = ("--flow", "dis", "--method", "identity")
+    assert run(dataset, out, *options, "--stop", "2") == 0
+    content = load(out, STATE)
+    del content["checksum"]
+    if isinstance(summary, dict):
+        summary = content["summary"] | summary
+    content["summary"] = summary
+    content["checksum"] = checksum(json.dumps(content))
+    (out / STATE).write_text(json.dumps(content))
+    capsys.readouterr()
+    assert run(dataset, out, *options, "--stop", "2", "--resume") == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said and said.count("\n") == 1
+    assert "cannot be resumed" in said
+
+
+def test_the_path_of_another_frame(dataset, tmp_path, monkeypatch):
+    """The robot's base, 30 cm behind the camera and turned: camera path and scores stay."""
+    given = ("--flow", "file", "--method", "classical")
+    assert run(dataset, tmp_path / "camera", *given) == 0
+    T = se3_exp(np.array([0.0, 0.1, -0.3, 0.2, 0.0, 0.5]))
+    begin = Sequence._begin
+
+    def with_frame(self, *arguments):
+        begin(self, *arguments)
+        self.T_cam_frame = T
+
+    monkeypatch.setattr(Sequence, "_begin", with_frame)
+    assert run(dataset, tmp_path / "base", *given) == 0
+    expected = np.linalg.inv(T) @ poses(tmp_path / "camera") @ T
+    np.testing.assert_allclose(poses(tmp_path / "base"), expected, atol=1e-9)
+    assert (
+        load(tmp_path / "base")["ate_rmse"] == load(tmp_path / "camera")["ate_rmse"]
+    )

@@ -44,7 +44,7 @@ def state(path: Path) -> dict:
 def test_results_are_replaced_only_when_asked_and_nothing_else(tmp_path):
     with start(tmp_path) as folder:
         folder.save("done")
-    with pytest.raises(InputError, match=r"--overwrite.*--resume"):
+    with pytest.raises(InputError, match=r"--resume.*--out.*--overwrite"):
         with start(tmp_path):
             pass
     (tmp_path / "trajectory.tum").write_text("old")

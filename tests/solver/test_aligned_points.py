@@ -28,7 +28,7 @@ from hybridvo_lab.synthetic.slow_scenes import (
 )
 
 SIZE = (240, 320)
-CAMERA = Camera(300.0, 300.0, 159.5, 119.5, *SIZE)
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, height=SIZE[0], width=SIZE[1])
 NO_MOTION = Motion(photometric=PhotometricReport(gain=1.0))
 NOISE = 2.0
 CUTOFF = RefineOptions().cutoff

@@ -14,7 +14,7 @@ from hybridvo.core.results import Reason
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.solver.depths import DepthAgreement, compare_depths
 
-K = Camera(140, 140, 127.5, 95.5, 192, 256)
+K = Camera(140, 140, 127.5, 95.5, height=192, width=256)
 T = se3_exp(np.array([0.05, -0.03, 0.1, 0.01, -0.02, 0.015]))
 
 
@@ -47,7 +47,7 @@ def with_depths(pair: FramePair, change) -> FramePair:
 
 def test_numbers_by_hand() -> None:
     # 200 points 3 m away
-    camera, weights = Camera(9, 9, 0, 0, 10, 300), np.zeros((10, 300))
+    camera, weights = Camera(9, 9, 0, 0, height=10, width=300), np.zeros((10, 300))
     weights[3, :200] = 1.0
     depth = np.full((10, 300), 3.0)
     prev, flow = Frame(None, depth.copy(), camera), np.zeros((10, 300, 2))

@@ -11,7 +11,7 @@ from hybridvo.core.geometry import ego_flow, se3_exp
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.solver.depths import compare_depths
 
-K = Camera(90, 95, 63.5, 47.5, 96, 128)
+K = Camera(90, 95, 63.5, 47.5, height=96, width=128)
 T = se3_exp(np.array([0.02, -0.03, 0.4, 0.01, -0.02, 0.03]))
 
 

@@ -73,8 +73,8 @@ def rows_at(factor, T):
 
 def test_jacobian_holds_away_from_the_identity_and_between_two_cameras():
     """A frontal wall at 2 m, painted smoothly; the camera turns, moves, comes nearer and zooms."""
-    prev = Camera(100, 105, 63.5, 47.5, 96, 128)
-    curr = Camera(115, 120, 60.0, 50.0, 96, 128)
+    prev = Camera(100, 105, 63.5, 47.5, height=96, width=128)
+    curr = Camera(115, 120, 60.0, 50.0, height=96, width=128)
     T = se3_exp(np.array([0.1, -0.05, -0.3, 0.02, -0.03, 0.1]))
 
     def painted(x, y):

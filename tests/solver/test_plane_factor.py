@@ -130,7 +130,7 @@ def test_two_equally_rounded_maps_are_not_taken_for_exact():
     rows, columns = np.mgrid[0:120, 0:160]
     waves = np.sin(columns / 17.0) + np.cos(rows / 13.0)
     depth = rounded(2.0 + 0.3 * waves, 0.00285)
-    camera = hvo.Camera(160, 160, 79.5, 59.5, 120, 160)
+    camera = hvo.Camera(160, 160, 79.5, 59.5, height=120, width=160)
     frame = hvo.Frame(None, depth, camera)
     pair = hvo.FramePair(frame, frame, None)
     planes = planes_of(pair).weighted(np.ones((120, 160)), 0.5, RefineOptions())

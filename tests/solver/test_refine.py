@@ -18,7 +18,7 @@ from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo_lab.synthetic.noise_scenarios import make_pair
 from tests import worlds
 
-CAMERA = Camera(350.0, 340.0, 159.0, 82.0, 160, 320)
+CAMERA = Camera(350.0, 340.0, 159.0, 82.0, height=160, width=320)
 
 
 def scene(seed: int, camera: Camera = CAMERA) -> np.ndarray:
@@ -163,7 +163,7 @@ def test_noisy_depth_does_not_shorten_the_translation():
 def narrow_plane(seed: int, sf: float, sd: float):
     """(pair, T): a slanted plane through a long lens, where rotation and translation trade off."""
     rng = np.random.default_rng(3000 + seed)
-    camera = Camera(900.0, 900.0, 159.5, 79.5, 160, 320)
+    camera = Camera(900.0, 900.0, 159.5, 79.5, height=160, width=320)
     u, v = np.meshgrid(np.arange(320), np.arange(160))
     rays = np.dstack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)]

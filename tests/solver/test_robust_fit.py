@@ -17,7 +17,7 @@ from hybridvo.solver.noise_estimation import (
 from hybridvo.solver.pixels import PixelGrid
 from hybridvo.solver.torch.factors import ResidualModel, gather_pixels, weigh
 
-CAMERA = Camera(300.0, 290.0, 79.5, 59.5, 120, 160)
+CAMERA = Camera(300.0, 290.0, 79.5, 59.5, height=120, width=160)
 XI = np.array([0.05, -0.03, 0.08, 0.01, -0.015, 0.02])
 
 

@@ -101,7 +101,7 @@ def test_errors_are_those_worked_by_hand():
     from hybridvo import Camera, Frame, FramePair
     from hybridvo.core.geometry import se3_exp
 
-    camera = Camera(100.0, 100.0, 31.5, 23.5, 48, 64)
+    camera = Camera(100.0, 100.0, 31.5, 23.5, height=48, width=64)
     frame = Frame(None, np.full((48, 64), 2.0), camera)
     T = np.eye(4)
     T[0, 3] = 0.02  # 100 px * 0.02 m / 2 m = 1 px

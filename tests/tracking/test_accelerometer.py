@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, make_transform
 from hybridvo.core.results import RelativePose
-from hybridvo.run.commands.run import restored, saved
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo_lab.synthetic.render import SyntheticSequence
 from hybridvo_lab.synthetic.scenes import make_scene

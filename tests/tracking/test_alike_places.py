@@ -43,7 +43,9 @@ def row_of_bays(seed: int, positions: np.ndarray, size: tuple[int, int]) -> Scen
     """Make the bays, and a camera that looks at the wall from N places along the row, in bays."""
     height, width = size
     focal = float(width)
-    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, height, width)
+    camera = Camera(
+        focal, focal, (width - 1) / 2, (height - 1) / 2, height=height, width=width
+    )
     T_world_cam = np.tile(np.eye(4), (len(positions), 1, 1))
     T_world_cam[:, 0, 3] = BAY_WIDTH * np.asarray(positions)
     solids = [

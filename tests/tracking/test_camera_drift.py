@@ -48,7 +48,7 @@ def rolled(turn: np.ndarray, start: float, readout: float, seed: int) -> hvo.Fra
 
     ``turn``: rotation vector of a period; ``start`` and ``readout``: in periods.
     """
-    camera = hvo.Camera(280.0, 280.0, 159.5, 119.5, 240, 320)
+    camera = hvo.Camera(280.0, 280.0, 159.5, 119.5, height=240, width=320)
     ones = np.ones(camera.shape)
     rays = backproject(ones, camera)
     depth = 3.0 / np.linalg.norm(rays, axis=-1)

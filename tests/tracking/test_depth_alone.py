@@ -112,7 +112,7 @@ def test_no_depth_and_no_texture_is_a_failure(walk):
 
 def test_a_wall_leaves_open_what_it_does_not_show():
     """Of six directions it shows three: the others stay as expected, and as uncertain."""
-    camera = hvo.Camera(160, 160, 79.5, 59.5, 120, 160)
+    camera = hvo.Camera(160, 160, 79.5, 59.5, height=120, width=160)
     rng = np.random.default_rng(0)
     walls = [
         (2.0 + 0.004 * rng.standard_normal((120, 160))).astype(np.float32)

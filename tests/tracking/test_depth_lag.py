@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import hybridvo as hvo
+from hybridvo.core.geometry import se3_exp
+from hybridvo.core.results import Step
 from hybridvo.run.commands.diagnosis.depth_lag import depth_lag
 from hybridvo.tracking.camera_drift import Bend
-from hybridvo.tracking.depth_lag import find_lag, mean_lag
+from hybridvo.tracking.depth_lag import _turn_of, find_lag, mean_lag
 from tests.late_depth import late_frames, untold
 
 
@@ -25,6 +28,20 @@ def test_a_frame_that_comes_twice_shows_nothing() -> None:
     frame = late_frames(0, 12.0, 1)[0]
     stamped = [replace(frame, timestamp=k / 30) for k in range(30)]
     assert find_lag(stamped) is None
+
+
+@pytest.mark.parametrize("again", [(), ("rgb",), ("depth",), ("rgb", "depth")])
+def test_only_a_step_between_fresh_frames_tells_how_the_camera_turned(
+    again: tuple[str, ...],
+) -> None:
+    prev, curr = late_frames(0, 12.0, 2)
+    curr = replace(curr, **{name: getattr(prev, name) for name in again})
+    motion = hvo.RelativePose(se3_exp(np.array([0, 0, 0, 0.01, 0, 0])), np.eye(6))
+    step = Step(1, curr.timestamp, np.eye(4), motion, prev_index=0)
+    turn = _turn_of(replace(prev, index=0), replace(curr, index=1), step)
+    assert (turn is None) == bool(again)
+    if turn is not None:
+        np.testing.assert_allclose(turn.rate, (0.3, 0, 0), rtol=1e-6)
 
 
 def test_outliers_hardly_move_the_mean() -> None:

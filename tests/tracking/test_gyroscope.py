@@ -233,7 +233,9 @@ def test_samples_are_joined_parted_and_moved_to_another_clock() -> None:
 
 
 def test_something_else_than_samples_is_refused() -> None:
-    frame = hvo.Frame(None, np.ones((4, 4)), hvo.Camera(4, 4, 1.5, 1.5, 4, 4))
+    frame = hvo.Frame(
+        None, np.ones((4, 4)), hvo.Camera(4, 4, 1.5, 1.5, height=4, width=4)
+    )
     with pytest.raises(hvo.InputError, match="imu"):
         hvo.Odometry().track(frame, imu=np.zeros((3, 3)))  # type: ignore[arg-type]
 

@@ -24,7 +24,7 @@ from hybridvo.tracking.search import Estimate
 from hybridvo.tracking.tracker_state import TrackerState
 
 SIZE = (120, 160)
-CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, *SIZE)
+CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, height=SIZE[0], width=SIZE[1])
 WALL_M, LORRY_M = 4.0, 1.0
 NOTHING_KNOWN = np.zeros((6, 6))
 

@@ -29,7 +29,7 @@ from hybridvo.tracking.keyframes import (
 )
 from tests import slow_walk
 
-CAMERA = hvo.Camera(100.0, 100.0, 31.5, 23.5, 48, 64)
+CAMERA = hvo.Camera(100.0, 100.0, 31.5, 23.5, height=48, width=64)
 SIDEWAYS = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 

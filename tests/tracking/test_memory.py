@@ -22,7 +22,7 @@ from hybridvo.evidence.calibration import HANDED_OVER, SEEN_THROUGH_LOG_ODDS
 from hybridvo.judge.calibration import DIRECT_PROBABILITY
 from hybridvo.judge.probability import probability_of
 from hybridvo.pipeline import sure_alignment
-from hybridvo.run.commands.run import restored, saved
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo.solver.align import align_images
 from hybridvo.solver.points import grid_index
 from hybridvo.solver.visibility import visibility
@@ -43,7 +43,7 @@ from hybridvo_lab.synthetic.slow_scenes import slow_scene
 from tests import slow_walk
 
 SIZE = (120, 160)
-CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, *SIZE)
+CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, height=SIZE[0], width=SIZE[1])
 WALL = 2.0
 BOX = np.s_[30:90, 60:100]
 LARGE_BOX = np.s_[10:110, 40:130]

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.core.geometry import invert, se3_log
+from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.options import Options, TrackOptions
-from hybridvo.core.results import Step
-from hybridvo.objects.followed import MAX_OBJECTS, Things, after_step
+from hybridvo.core.results import Status, Step
+from hybridvo.objects.followed import MAX_OBJECTS, Things, _velocity, after_step
 from hybridvo.objects.motions import (
     Earlier,
+    Fit,
     GridView,
 )
-from hybridvo.run.commands.run import restored, saved
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo_lab.synthetic.scenes import make_scene
 from tests.worlds import CHI2_3SIGMA
 
 SIZE = (120, 160)
-CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, *SIZE)
+CAMERA = hvo.Camera(160.0, 160.0, 79.5, 59.5, height=SIZE[0], width=SIZE[1])
 WALL = 3.0
 ON = Options(track=TrackOptions(objects="auto"))
 OFF = Options(track=TrackOptions(objects="off"))
@@ -283,3 +285,15 @@ def test_one_in_the_corner_is_followed() -> None:
     seen = follow([view(box, index=k) for k, box in enumerate(boxes)])
     assert [[thing.id for thing in things] for things in seen] == [[1]] * 3
     assert is_within_3_sigma(seen[-1][0], aside(3))
+
+
+def test_two_measurements_of_a_motion_are_surer_than_one() -> None:
+    """Equally sure ones meet in the middle, with half of the covariance of each."""
+    covariance = np.diag([1e-4, 2e-4, 3e-4, 1e-5, 2e-5, 3e-5])
+    ahead = SimpleNamespace(T_own=np.eye(4), covariance=covariance)
+    view_of = SimpleNamespace(before=SimpleNamespace(T_curr_prev=np.eye(4)))
+    step = np.array([0.02, 0, 0, 0, 0, 0])
+    fit = Fit(se3_exp(step), covariance, Status(), 1.0)
+    T_own, stated = _velocity(ahead, fit, view_of, 1)
+    np.testing.assert_allclose(se3_log(T_own), step / 2, atol=1e-12)
+    np.testing.assert_allclose(stated, covariance / 2, rtol=1e-9)

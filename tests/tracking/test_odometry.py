@@ -19,7 +19,7 @@ from hybridvo.pipeline import DEFAULT_METHOD
 from hybridvo_lab.synthetic.scenes import make_scene
 
 HEIGHT, WIDTH = 48, 64
-CAMERA = Camera(60, 60, 31.5, 23.5, HEIGHT, WIDTH)
+CAMERA = Camera(60, 60, 31.5, 23.5, height=HEIGHT, width=WIDTH)
 MOTION = se3_exp(np.array([0.03, -0.02, 0.08, 0.004, -0.006, 0.003]))
 
 
@@ -187,7 +187,9 @@ def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
     vo = tracker()
     vo.track(frame(0))
     small = Frame(
-        None, np.ones((24, 32), np.float32), Camera(30, 30, 15.5, 11.5, 24, 32)
+        None,
+        np.ones((24, 32), np.float32),
+        Camera(30, 30, 15.5, 11.5, height=24, width=32),
     )
     with pytest.raises(InputError, match=r"\(48, 64\).*\(24, 32\)"):
         vo.track(small)

@@ -127,7 +127,9 @@ def blank(
     index: int, readout_ms: float = 0.0, stamp: float | None = None
 ) -> hvo.Frame:
     """A frame that shows nothing."""
-    camera = hvo.Camera(40.0, 40.0, 31.5, 23.5, 48, 64, readout_ms=readout_ms)
+    camera = hvo.Camera(
+        40.0, 40.0, 31.5, 23.5, height=48, width=64, readout_ms=readout_ms
+    )
     depth = np.full(camera.shape, 2.0, np.float32)
     time = PERIOD_S * index if stamp is None else stamp
     return hvo.Frame(None, depth, camera, timestamp=time, index=index)

@@ -13,7 +13,7 @@ from hybridvo.core.geometry import invert, se3_log
 from hybridvo.tracking.repeated import Repeat, repeat_of
 from tests import slow_walk
 
-CAMERA = hvo.Camera(100.0, 100.0, 31.5, 23.5, 48, 64)
+CAMERA = hvo.Camera(100.0, 100.0, 31.5, 23.5, height=48, width=64)
 AT = 5
 
 

@@ -144,7 +144,7 @@ def views(
     whole = recording.frames[0].camera
     height, width = WINDOW
     middle = ((width - 1) / 2, (height - 1) / 2)
-    window = Camera(whole.fx, whole.fy, *middle, height, width)
+    window = Camera(whole.fx, whole.fy, *middle, height=height, width=width)
     return turning_camera(recording, R, window), R[0].T @ R
 
 

@@ -269,7 +269,7 @@ def frontal_plane(degrees: float) -> Known:
 
     height, width = 180, 240
     focal = 0.5 * width / np.tan(0.5 * np.radians(degrees))
-    camera = Camera(focal, focal, 119.5, 89.5, height, width)
+    camera = Camera(focal, focal, 119.5, 89.5, height=height, width=width)
     depth = np.full((height, width), 5.0, np.float32)
     T = se3_exp(np.array([0.02, -0.01, 0.03, 0.001, 0.002, 0.001]))
     flow = ego_flow(depth, T, camera, camera)
@@ -395,7 +395,7 @@ def little_texture(seed: int) -> list[Record]:
     from hybridvo.flow.providers import dis_flow
 
     height, width = 200, 300
-    camera = Camera(300.0, 300.0, 149.5, 99.5, height, width)
+    camera = Camera(300.0, 300.0, 149.5, 99.5, height=height, width=width)
     depth = np.full((height, width), 3.0, np.float32)
     # so far apart, blurred spots do not touch each other
     rows = range(10, height - 10, 10)

@@ -27,7 +27,7 @@ def recording(images: Sequence[np.ndarray], depths: Sequence[np.ndarray]) -> Any
     from hybridvo import Camera, Frame
     from hybridvo.io.data.sequence import Sequence as Base
 
-    camera = Camera(150.0, 150.0, 79.5, 59.5, HEIGHT, WIDTH)
+    camera = Camera(150.0, 150.0, 79.5, 59.5, height=HEIGHT, width=WIDTH)
 
     class Recording(Base):
         """Frames in memory, as a reader hands them out."""
@@ -178,7 +178,7 @@ def wrong_limits(kind: str, metres: float, seed: int) -> list[Record]:
     from hybridvo import Camera
     from hybridvo_lab.evaluation.scores import wrong_limit
 
-    camera = Camera(500.0, 500.0, 319.5, 239.5, 480, 640)
+    camera = Camera(500.0, 500.0, 319.5, 239.5, height=480, width=640)
     limit = wrong_limit(kind, camera, np.full(camera.shape, metres, np.float32))
     return [labelled("limit", std=1e3 * limit)]
 

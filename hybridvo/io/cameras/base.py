@@ -110,7 +110,7 @@ class FrameMaker:
 
     Example:
         >>> from hybridvo.core.types import Camera
-        >>> lens = Lens(Camera(50.0, 50.0, 1.0, 0.5, 2, 3))
+        >>> lens = Lens(Camera(50.0, 50.0, 1.0, 0.5, height=2, width=3))
         >>> maker = FrameMaker(lens, CameraSettings(max_depth_m=4.0))
         >>> frame = maker.frame(np.zeros((2, 3), np.uint8), np.full((2, 3), 5.0), 0.1)
         >>> float(frame.depth.max())

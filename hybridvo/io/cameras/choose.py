@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.options import NETWORK
+from hybridvo.core.pages import page
 from hybridvo.core.types import Frame
 from hybridvo.io.cameras.base import LiveCamera
 from hybridvo.io.cameras.folder import FolderCamera
@@ -98,7 +99,7 @@ def _camera(
         raise InputError(f"--preset {preset}: {what}.")
     if driver == "own":
         problem = "hybridvo has no driver for this camera"
-        raise InputError(f"--preset {preset}: {problem}; docs/live.md has one.")
+        raise InputError(f"--preset {preset}: {problem}; {page('live')} has one.")
     settings = settings or CameraSettings(driver=driver)  # type: ignore[arg-type]
     settings = dataclasses.replace(settings, **times)  # type: ignore[arg-type]
     if not imu:

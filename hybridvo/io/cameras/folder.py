@@ -87,6 +87,11 @@ class FolderCamera:
             return Reading(None, number=index, note=note, is_gone=True)
         except (InputError, OSError) as error:
             return Reading(None, number=index, note=self._note(index, error))
+        # a recording that is one file lists none
+        listed = dict(enumerate(self._sequence.rgb_files)).get(index)
+        if listed is not None and frame.rgb is None:
+            note = f"the image of frame {index} is gone: {listed}"
+            return Reading(None, number=index, note=note, is_gone=True)
         age = self._clock() - self._started - self._due[index]
         imu = self._samples(frame.timestamp)
         return Reading(frame, max(float(age), 0.0), index, imu=imu)

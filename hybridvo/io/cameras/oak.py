@@ -161,7 +161,9 @@ class OakCamera:
         """The intrinsics of an image after all that the device has done to it."""
         K = image.getTransformation().getIntrinsicMatrix()
         height, width = shape[:2]
-        return Lens(Camera(K[0][0], K[1][1], K[0][2], K[1][2], height, width))
+        return Lens(
+            Camera(K[0][0], K[1][1], K[0][2], K[1][2], height=height, width=width)
+        )
 
     def close(self) -> None:
         """Stop the pipeline and let the device go."""

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from hybridvo.core.errors import InputError
+from hybridvo.core.pages import page
 from hybridvo.core.types import Camera
 from hybridvo.io.cameras.base import CameraLost, FrameMaker, Reading
 from hybridvo.io.cameras.settings import CameraSettings
@@ -45,7 +46,7 @@ class OpenCVCamera:
         if not cv2.videoio_registry.hasBackend(cv2.CAP_OPENNI2):
             problem = f"OpenCV {cv2.__version__} was built without OpenNI 2"
             raise InputError(
-                f"camera opencv: {problem}, as all of pip are; see docs/live.md."
+                f"camera opencv: {problem}, as all of pip are; see {page('live')}."
             )
         for option in self._settings.options:
             if not option.startswith("CAP_PROP_") or not hasattr(cv2, option):
@@ -92,7 +93,7 @@ class OpenCVCamera:
         if given is None:
             focal = self._capture.get(cv2.CAP_OPENNI_DEPTH_GENERATOR_FOCAL_LENGTH)
             given = (focal, focal, (width - 1) / 2, (height - 1) / 2)
-        return Lens(Camera(*given, height, width))
+        return Lens(Camera(*given, height=height, width=width))
 
     def close(self) -> None:
         """Let the device go."""

@@ -132,7 +132,9 @@ class OrbbecCamera:
         """The intrinsics that the camera states of its colour."""
         at = profile.get_intrinsic()
         d = profile.get_distortion()
-        camera = Camera(at.fx, at.fy, at.cx, at.cy, at.height, at.width)
+        camera = Camera(
+            at.fx, at.fy, at.cx, at.cy, height=at.height, width=at.width
+        )
         coefficients = (d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6)
         return Lens(camera, coefficients, "rational_polynomial")
 

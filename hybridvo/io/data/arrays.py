@@ -13,8 +13,10 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from hybridvo.core.checks import as_rigid
+from hybridvo.core.depth_units import scale_is_unknown
 from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import unpacked_limit
+from hybridvo.core.pages import page
 from hybridvo.core.trajectory import FILE_TOLERANCE, to_seconds
 from hybridvo.core.types import Camera
 from hybridvo.io.data.camera_file import parse_camera
@@ -110,10 +112,8 @@ class ArraySequence(StreamSequence):
         self._units = 1.0
         if self._depth.dtype.kind == "u" or self._given_scale is not None:
             if self._given_scale is None:
-                raise InputError(
-                    f"{self.root}: depth is of whole numbers: expected an array 'depth_scale', "
-                    "or --depth-scale: units per metre, 1000 for mm."
-                )
+                text = scale_is_unknown(self._depth[0], "an array 'depth_scale'")
+                raise InputError(f"{self.root}: {text}")
             self._units = units_per_metre(self._given_scale, 1.0, self.warnings)
 
     def _take_distortion(self, distortion: tuple[float, ...]) -> None:
@@ -155,7 +155,7 @@ class ArraySequence(StreamSequence):
             there = abbreviated(self._names()) or "none"
             raise FormatError(
                 f"{self.root}: no frames: there is no array '{name}'; there are: {there}. "
-                "Expected rgb, depth and K, as docs/own-data.md has them."
+                f"Expected rgb, depth and K, as {page('own-data')} has them."
             )
         is_rgb = name == "rgb"
         shapes = array.ndim == 3 or (

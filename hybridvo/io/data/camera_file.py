@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,9 @@ RECORDER_FILES = (
 """What recorders call the file of the camera: Open3D's first, then examples of RealSense."""
 OPTIONAL_KEYS = ("readout_ms", "depth_lag_ms")
 """Keys of the camera that its file may have."""
-CAMERA_KEYS = tuple(k for k in Camera.__annotations__ if k not in OPTIONAL_KEYS)
+CAMERA_KEYS = tuple(
+    field.name for field in fields(Camera) if field.name not in OPTIONAL_KEYS
+)
 """Keys that a camera file must have."""
 KNOWN_KEYS = (*CAMERA_KEYS, *OPTIONAL_KEYS, "distortion", "depth_scale", "fps")
 """Keys that a camera file may have."""
@@ -99,7 +102,7 @@ def parse_camera(
     numbers = [as_number(part) for part in str(camera).split(",")]
     if len(numbers) == 4 and np.isfinite(numbers).all():
         fx, fy, cx, cy = numbers
-        return Calibration(Camera(fx, fy, cx, cy, *shape))
+        return Calibration(Camera(fx, fy, cx, cy, height=shape[0], width=shape[1]))
     path = Path(camera)
     try:
         if path.suffix.lower() == ".npy":

@@ -205,7 +205,9 @@ class TartanAirSequence(Sequence):
         focal_length = width / 2
         cx = (width - 1) / 2
         cy = (height - 1) / 2
-        camera = Camera(focal_length, focal_length, cx, cy, height, width)
+        camera = Camera(
+            focal_length, focal_length, cx, cy, height=height, width=width
+        )
         return Calibration(camera)
 
     def _read_depth(self, path: Path) -> np.ndarray:
@@ -320,6 +322,7 @@ class TumSequence(Sequence):
     """
 
     kind = "tum"
+    choices = ("depth_offset_ms",)
     true_path: TruePath | None = None
     depth_scale = 5000.0
     markers: tuple[tuple[str, ...], ...] = (
@@ -343,6 +346,7 @@ class TumSequence(Sequence):
         """Match the images and the depth maps of two lists by time."""
         stamps, rgb_names = self._read_list(colour)
         depth_stamps, depth_names = self._read_list(depth)
+        depth_stamps = self._by_colours_clock(depth_stamps)
         if are_durations(stamps) and len(depth_names) == len(rgb_names):
             stamps = self._counted(len(stamps))
             depth_stamps = stamps
@@ -414,7 +418,11 @@ class TumSequence(Sequence):
         name = self.name.lower().replace("freiburg", "fr")
         for word, published in PUBLISHED.items():
             if word in name:
-                camera = Camera(*published.intrinsics, *KINECT_SIZE)
+                camera = Camera(
+                    *published.intrinsics,
+                    height=KINECT_SIZE[0],
+                    width=KINECT_SIZE[1],
+                )
                 return Calibration(camera, published.distortion)
         intrinsics = ICL_INTRINSICS if self._is_icl else KINECT_INTRINSICS
         reason = (
@@ -422,7 +430,9 @@ class TumSequence(Sequence):
             "else give --camera fx,fy,cx,cy"
         )
         self._assume(f"camera {intrinsics} (fx fy cx cy) is assumed: {reason}")
-        return Calibration(Camera(*intrinsics, *KINECT_SIZE))
+        return Calibration(
+            Camera(*intrinsics, height=KINECT_SIZE[0], width=KINECT_SIZE[1])
+        )
 
 
 def are_durations(stamps: np.ndarray) -> bool:
@@ -481,7 +491,9 @@ class SevenScenesSequence(Sequence):
 
     def _calibration(self) -> Calibration:
         # These intrinsics stand on the page of the data set.
-        return Calibration(Camera(585, 585, 320, 240, *KINECT_SIZE))
+        return Calibration(
+            Camera(585, 585, 320, 240, height=KINECT_SIZE[0], width=KINECT_SIZE[1])
+        )
 
 
 # -- KITTI odometry ----------------------------------------------------------------------

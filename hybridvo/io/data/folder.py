@@ -26,6 +26,7 @@ class FolderSequence(Sequence):
     """A user's own recording, in the layout that docs/own-data.md describes."""
 
     kind = "folder"
+    choices = ("depth_offset_ms",)
     depth_source = "file"
     markers: tuple[tuple[str, ...], ...] = ((CAMERA_FILE,),)
     image_folder = "rgb"
@@ -119,6 +120,7 @@ class FolderSequence(Sequence):
             depth_list = self.root / "depth_timestamps.txt"
             depth_stamps = known(files, depth_list, self.warnings)
             if stamps is not None and depth_stamps is not None:
+                depth_stamps = self._by_colours_clock(depth_stamps)
                 pairs = lists.depth_at(
                     stamps, depth_stamps, self.root, self.warnings
                 )

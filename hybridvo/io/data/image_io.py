@@ -29,6 +29,8 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 """The first bytes of a PNG."""
 JPEG_MAGIC = b"\xff\xd8"
 """The first bytes of a JPEG."""
+JPEG_SCAN = b"\xff\xda"
+"""What starts the pixels of a JPEG: one scan, or several of a progressive one."""
 UNKNOWN_FLOW = 1e9
 """Length of flow, pixels, from which it is unknown: Middlebury's mark."""
 FLOW_PNG_OFFSET = 32768
@@ -48,8 +50,13 @@ NPY_HEAD_BYTES = 2**16
 """Bytes in which a .npy file must state its shape: the longest header of format 1."""
 JPEG_PIXELS_PER_BYTE = 512
 """Most pixels that a byte of a JPEG can hold: a block of 8x8 takes at least a bit."""
+MAX_JPEG_SCANS = 100
+"""Most scans of a JPEG: an encoder makes ten at most. A decoder goes over all of the image for
+each, and a scan of no content has some bytes."""
 PNG_BITS_PER_BYTE = 8 * 1032
 """Most bits that a byte of a PNG can hold: the limit of deflate."""
+MAX_MATRIX_BYTES = 2**12
+"""Bytes of a text of 16 numbers."""
 MAX_BYTES_PER_PIXEL = 8
 """Bytes of a pixel with four values of 16 bits, which are not compressed."""
 PNG_HEADER_BYTES = 33
@@ -274,7 +281,10 @@ def as_pose(stored: np.ndarray, where: str) -> np.ndarray:
 def numbers_of_matrix(path: Path) -> np.ndarray:
     """Read a matrix (4, 4) from a text of 16 numbers; they may be infinite."""
     try:
-        return np.array(read_text(path).split(), np.float64).reshape(4, 4)
+        words = read_text(path, MAX_MATRIX_BYTES).split()
+        return np.array(words, np.float64).reshape(4, 4)
+    except FormatError:
+        raise
     except ValueError as error:
         raise FormatError(
             f"{path}: expected 16 numbers of a 4x4 matrix ({error})."
@@ -529,6 +539,7 @@ def _decode(path: str | Path, flags: int, size: Size) -> np.ndarray:
 def _decode_whole(path: str | Path, data: bytes, flags: int) -> np.ndarray:
     """Decode all bytes of a PNG or JPEG, whose header was checked."""
     _check_end(path, data)
+    _check_scans(path, data)
     # Orientation is ignored: the intrinsics belong to the pixels as they are stored.
     flags |= cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -549,7 +560,17 @@ def _check_end(path: str | Path, data: bytes) -> None:
         pixels = b"IDAT"
         closing = b"IEND"
     else:
-        pixels = b"\xff\xda"
+        pixels = JPEG_SCAN
         closing = b"\xff\xd9"
     if data.rfind(closing) <= data.rfind(pixels):
         raise FormatError(f"{path}: truncated: {len(data)} bytes end too early.")
+
+
+def _check_scans(path: str | Path, data: bytes) -> None:
+    """Refuse a JPEG of so many scans that decoding it would last."""
+    scans = 0 if data.startswith(PNG_MAGIC) else data.count(JPEG_SCAN)
+    if scans > MAX_JPEG_SCANS:
+        raise FormatError(
+            f"{path}: expected a JPEG of at most {MAX_JPEG_SCANS} scans, got {scans}. If you know "
+            "where it comes from, save it anew without 'progressive'."
+        )

@@ -67,6 +67,8 @@ READERS: dict[str, type[Sequence]] = {
     "transforms": TransformsSequence,
 }
 """The readers by kind, in the order in which they are tried on a folder."""
+WITHOUT_FOLDERS = ("bag", "arrays", "sens", "record3d", "kinect", "video")
+"""Kinds whose recordings are files: a folder beside them is no part of them."""
 LOOKED_AT = 200
 """Entries of a folder that is no sequence in which sequences are looked for."""
 RECORDINGS = ".bag, .mcap, .db3, .npz, .mkv, .mp4, .r3d, .sens"
@@ -88,11 +90,15 @@ def open_sequence(
     topic_depth: str | None = None,
     topic_info: str | None = None,
     topic_truth: str | None = None,
+    topic_imu: str | None = None,
+    imu_rotation: str | None = None,
+    frame: str | None = None,
     depth_dir: str | None = None,
     stereo: float | str | bool | None = None,
     depth: str | None = None,
     readout_ms: float | None = None,
     depth_lag_ms: float | None = None,
+    depth_offset_ms: float | None = None,
     fps: float | None = None,
     needs_depth: bool = True,
     trust: bool = False,
@@ -112,12 +118,19 @@ def open_sequence(
         topic_depth: That of depth.
         topic_info: That of the camera of colour.
         topic_truth: That of true poses.
+        topic_imu: That of the inertial sensor.
+        imu_rotation: The unit quaternion ``x,y,z,w`` that turns the axes of the inertial sensor of
+            a bag into those of the camera; by default by ``/tf_static``.
+        frame: A frame of reference that ``/tf_static`` of a bag connects to the camera, such as
+            ``base_link``: ``hybridvo run`` writes its path instead of the camera's.
         depth_dir: The folder of the depth maps of a video; by default ``depth`` beside it.
         stereo: Take depth from two cameras: the baseline, m, of rectified images in ``left`` and
             ``right``; True, or empty, where the sequence states it.
         depth: ``onnx:FILE``: a network predicts depth, also where the sequence has some.
         readout_ms: Replaces the camera's own: ms from the first row to the last, see Camera.
         depth_lag_ms: Replaces the camera's own: by how much depth is later than the image, ms.
+        depth_offset_ms: By how much the stamps of depth are late, ms, against those of the images:
+            it is subtracted before both are matched.
         fps: Frames a second, in place of the time stamps of the files: for files without any.
         needs_depth: Whether a video, or a folder of images, without depth is refused.
         trust: Whether foreign formats, such as bags and videos, are read in this process instead of
@@ -157,6 +170,10 @@ def open_sequence(
         topic_depth=topic_depth,
         topic_info=topic_info,
         topic_truth=topic_truth,
+        topic_imu=topic_imu,
+        imu_rotation=imu_rotation,
+        frame=frame,
+        depth_offset_ms=_milliseconds("depth_offset_ms", depth_offset_ms),
         depth_dir=depth_dir,
         stereo=_baseline(stereo),
     )
@@ -233,7 +250,7 @@ def _opened(
 ) -> Sequence:
     """Open a sequence with what was given for it; an InputError where it does not take that."""
     scale = None if depth_scale is None else float(depth_scale)
-    known = reader.choices if issubclass(reader, StreamSequence) else ()
+    known = reader.choices
     wants_stereo = "stereo" in given
     if "stereo" not in known and given.get("stereo") == "":
         # KITTI's reader finds the right images by itself
@@ -306,11 +323,20 @@ def _stated_times(readout_ms: Any, depth_lag_ms: Any) -> dict[str, float]:
             raise InputError(f"readout_ms: expected milliseconds from 0 on, {got}.")
         times["readout_ms"] = float(readout_ms)
     if depth_lag_ms is not None:
-        if not abs(as_number(depth_lag_ms)) < float("inf"):
-            got = f"got {str(depth_lag_ms)[:80]!r}"
-            raise InputError(f"depth_lag_ms: expected milliseconds, {got}.")
-        times["depth_lag_ms"] = float(depth_lag_ms)
+        times["depth_lag_ms"] = float(
+            _milliseconds("depth_lag_ms", depth_lag_ms) or 0
+        )
     return times
+
+
+def _milliseconds(name: str, value: Any) -> str | None:
+    """Return a time as text, None where there is none; an InputError where it is no time."""
+    if value is None:
+        return None
+    if not abs(as_number(value)) < float("inf"):
+        got = f"got {str(value)[:80]!r}"
+        raise InputError(f"{name}: expected milliseconds, {got}.")
+    return str(float(value))
 
 
 def _check_rate(fps: Any) -> None:
@@ -368,7 +394,8 @@ def _why_unknown(folder: Path) -> str:
     if lack := _lack_of(folder):
         return lack
     above = folder.absolute().parent
-    if any(reader.knows(above) for reader in READERS.values()):
+    layouts = [READERS[kind] for kind in READERS if kind not in WITHOUT_FOLDERS]
+    if any(reader.knows(above) for reader in layouts):
         return f"a part of a sequence: give the folder above it, {above}."
     names = [path.name for path in entries]
     content = abbreviated(names) or "nothing"

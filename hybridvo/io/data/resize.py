@@ -26,7 +26,7 @@ def resize_camera(camera: Camera, height: int, width: int) -> Camera:
         InputError: The camera is no :class:`Camera`, or the new size is not positive.
 
     Example:
-        >>> camera = resize_camera(Camera(500, 500, 319.5, 239.5, 480, 640), 240, 320)
+        >>> camera = resize_camera(Camera(500, 500, 319.5, 239.5, height=480, width=640), 240, 320)
         >>> camera.fx, camera.cx
         (250.0, 159.5)
     """
@@ -61,7 +61,7 @@ def resize_frame(frame: Frame, height: int, width: int) -> Frame:
         InputError: The frame is no :class:`Frame`, or the new size is not positive.
 
     Example:
-        >>> camera = Camera(500, 500, 319.5, 239.5, 480, 640)
+        >>> camera = Camera(500, 500, 319.5, 239.5, height=480, width=640)
         >>> frame = Frame(None, np.ones((480, 640), np.float32), camera)
         >>> half = resize_frame(frame, 240, 320)
         >>> half.depth.shape, half.camera.fx

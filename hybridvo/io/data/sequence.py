@@ -16,7 +16,11 @@ import cv2
 import numpy as np
 
 from hybridvo.core.checks import brief
-from hybridvo.core.depth_units import depth_unit_fix, typical_depth
+from hybridvo.core.depth_units import (
+    depth_unit_fix,
+    scale_is_unknown,
+    typical_depth,
+)
 from hybridvo.core.errors import FormatError, InputError, format_errors, printable
 from hybridvo.core.imu import ImuSamples, rising
 from hybridvo.core.trajectory import check_increasing
@@ -75,6 +79,9 @@ class Sequence:
         imu_samples: (M, 7) of an inertial sensor: stamp, s, of the clock of the frames; rates about
             its axes, rad/s; accelerations along them, m/s^2; None without one.
         R_cam_imu: (3, 3) rotation from its axes to those of the camera, likewise.
+        T_cam_frame: (4, 4) place of another frame of reference, such as ``base_link``, in the
+            camera's, m; None where the user asks for none.
+        chosen: What the user chose that only some kinds of sequences have: ``choices``.
         warnings: Sentences about what the user should know.
         height: Rows of every image, pixels.
         width: Columns of every image, pixels.
@@ -85,6 +92,8 @@ class Sequence:
     markers: tuple[tuple[str, ...], ...] = ()
     """Groups of file names, with wildcards. A folder that has all names of one group belongs to
     this reader."""
+    choices: tuple[str, ...] = ()
+    """Names of the keyword arguments of ``open_sequence`` that only some readers take."""
     depth_source = "sensor"
     """``sensor``, ``stereo``, ``file``, or ``true``: depth of a renderer, which is an oracle."""
     flow_is_true = False
@@ -103,11 +112,14 @@ class Sequence:
         depth_scale: float | None = None,
         mask: str | Path | None = None,
         needs_depth: bool = True,
+        **chosen: str,
     ) -> None:
         self._begin(root, root.name, camera, depth_scale, mask)
         self._needs_depth = needs_depth
+        self.chosen = chosen
         self._list_files()
         self._check_frames()
+        self._check_depth_offset()
         self.mask_files = self._list_masks()
         self._take_size()
         self._take_camera()
@@ -146,6 +158,8 @@ class Sequence:
         self.poses: np.ndarray | None = None
         self.imu_samples: np.ndarray | None = None
         self.R_cam_imu: np.ndarray | None = None
+        self.T_cam_frame: np.ndarray | None = None
+        self.chosen = {}
         self.warnings: list[str] = []
         self._camera: Camera | None = None
         self._lens: UndistortionMaps | None = None
@@ -192,6 +206,19 @@ class Sequence:
         return ImuSamples(
             chosen[:, 0], chosen[:, 1:4], self.R_cam_imu, accelerations
         )
+
+    def _by_colours_clock(self, depth_stamps: np.ndarray) -> np.ndarray:
+        """Return stamps of depth maps, seconds, without the offset that the user states."""
+        return depth_stamps - float(self.chosen.get("depth_offset_ms", 0)) / 1000
+
+    def _check_depth_offset(self) -> None:
+        """Refuse an offset of stamps by which nothing was matched."""
+        if "depth_offset_ms" in self.chosen and self.depth_timestamps is None:
+            raise InputError(
+                f"--depth-offset-ms: {self.root}: depth has no stamps of its own: it is matched by "
+                "names or by order. Of depth that is measured later than its image state "
+                "--depth-lag-ms."
+            )
 
     def _take_imu(self, samples: np.ndarray, R_cam_imu: np.ndarray) -> None:
         """Keep the samples (M, 7) of an inertial sensor that are finite and rise in time."""
@@ -304,6 +331,7 @@ class Sequence:
             "lens": lens,
             "depth_scale": self._given_scale or self.depth_scale,
             "mask": None if mask is None else os.path.relpath(mask, self.root),
+            **self.chosen,
         }
 
     # -- what a reader overrides -------------------------------------------------------
@@ -325,10 +353,8 @@ class Sequence:
             is_whole = stored.dtype.kind == "u"
             scale = self.depth_scale if is_whole else 1.0
         if scale is None:
-            needed = "'depth_scale' in camera.yaml, or --depth-scale: units per metre, 1000 for mm"
-            raise InputError(
-                f"{path}: depth is of whole numbers: expected {needed}."
-            )
+            where = "'depth_scale' in camera.yaml"
+            raise InputError(f"{path}: {scale_is_unknown(stored, where)}")
         return in_metres(stored, scale)
 
     def _read_flow(

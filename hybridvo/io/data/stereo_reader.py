@@ -329,7 +329,7 @@ def rig_of_settings(
 def _camera(content: dict[str, Any], height: Any, width: Any) -> Camera:
     fx, fy, cx, cy = (content.get(name) for name in ("fx", "fy", "cx", "cy"))
     readout_ms = content.get("readout_ms", 0.0)
-    return Camera(fx, fy, cx, cy, height, width, readout_ms)  # type: ignore[arg-type]
+    return Camera(fx, fy, cx, cy, height=height, width=width, readout_ms=readout_ms)  # type: ignore[arg-type]
 
 
 def _own_lens(content: Any, height: Any, width: Any, where: str) -> Lens:
@@ -371,7 +371,7 @@ def _lens_of_sensor(content: Any, where: str) -> Lens:
         coefficients = content.get("distortion_coefficients")
         if coefficients is None:
             coefficients = content.get("distortion_coeffs")
-        camera = Camera(fx, fy, cx, cy, height, width)
+        camera = Camera(fx, fy, cx, cy, height=height, width=width)
         distortion = tuple(float(value) for value in coefficients or ())
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(

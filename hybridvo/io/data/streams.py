@@ -121,11 +121,8 @@ class StreamSequence(Sequence):
     """Frames that are made when they are used.
 
     A reader overrides ``_open``, which fills in ``timestamps``, ``poses`` and ``_camera``, and
-    ``_images``, which makes one frame. ``choices`` are the names of the keyword arguments that
-    ``open_sequence`` hands to it in ``chosen``.
+    ``_images``, which makes one frame.
     """
-
-    choices: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -143,6 +140,7 @@ class StreamSequence(Sequence):
         self._open()
         if not len(self):
             raise InputError(f"{root}: no frames.")
+        self._check_depth_offset()
         check_increasing(self.timestamps, str(root))
         self.mask_files = self._list_masks()
         self._check_first_frame()
@@ -171,10 +169,6 @@ class StreamSequence(Sequence):
         """Return the files that are read."""
         inside = sorted(self.root.glob("*")) if self.root.is_dir() else [self.root]
         return [path for path in inside if path.is_file()]
-
-    def opened_with(self) -> dict[str, Any]:
-        """Return what decides how the files are read beside themselves, JSON-ready."""
-        return super().opened_with() | self.chosen
 
     def _open(self) -> None:
         """Fill in stamps, poses and camera; every reader has its own."""

@@ -29,8 +29,8 @@ class TwoCameras:
 
     Example:
         >>> import numpy as np
-        >>> colour = Lens(Camera(1000.0, 1000.0, 639.5, 479.5, 960, 1280))
-        >>> depth = Lens(Camera(500.0, 500.0, 319.5, 239.5, 480, 640))
+        >>> colour = Lens(Camera(1000.0, 1000.0, 639.5, 479.5, height=960, width=1280))
+        >>> depth = Lens(Camera(500.0, 500.0, 319.5, 239.5, height=480, width=640))
         >>> TwoCameras(colour, depth, np.eye(4)).camera.shape
         (480, 640)
     """

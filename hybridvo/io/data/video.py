@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number
+from hybridvo.core.depth_units import scale_is_unknown
 from hybridvo.core.errors import FormatError, InputError, format_errors
 from hybridvo.core.files import read_rows, read_text
 from hybridvo.core.geometry import make_transform
@@ -108,7 +109,7 @@ class VideoSequence(StreamSequence):
 
     kind = "video"
     depth_source = "file"
-    choices: tuple[str, ...] = ("depth_dir",)
+    choices: tuple[str, ...] = ("depth_dir", "depth_offset_ms")
 
     @classmethod
     def knows_without_depth(cls, folder: Path) -> bool:
@@ -207,7 +208,9 @@ class VideoSequence(StreamSequence):
                     f"{self.root}: {len(files)} depth maps for {count} frames: name them by "
                     "the number of their frame, from 0, or write depth_timestamps.txt."
                 )
+            depth_stamps = self._by_colours_clock(depth_stamps)
             pairs = lists.depth_at(stamps, depth_stamps, self.root, self.warnings)
+            self.depth_timestamps = depth_stamps[[j for _, j in pairs]]
         self.rgb_files = []
         self._frame_at = [i for i, _ in pairs]
         self.depth_files = [files[j] for _, j in pairs]
@@ -276,10 +279,8 @@ class VideoSequence(StreamSequence):
         if stored.dtype.kind != "u":
             return stored.astype(np.float32)
         if self._given_scale is None:
-            raise InputError(
-                f"{path}: depth is of whole numbers: expected 'depth_scale' in {CAMERA_FILE}, "
-                "or --depth-scale: units per metre, 1000 for mm."
-            )
+            where = f"'depth_scale' in {CAMERA_FILE}"
+            raise InputError(f"{path}: {scale_is_unknown(stored, where)}")
         return in_metres(stored, self._given_scale)
 
 

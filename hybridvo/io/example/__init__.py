@@ -38,7 +38,12 @@ def _frame(index: int) -> Frame:
     assert units is not None
     height, width = units.shape
     camera = Camera(
-        FOCAL_PX, FOCAL_PX, (width - 1) / 2, (height - 1) / 2, height, width
+        FOCAL_PX,
+        FOCAL_PX,
+        (width - 1) / 2,
+        (height - 1) / 2,
+        height=height,
+        width=width,
     )
     depth = units.astype("float32") / DEPTH_UNITS_PER_M
     return Frame(bgr[..., ::-1].copy(), depth, camera, index / HZ, index)

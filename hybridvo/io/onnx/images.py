@@ -48,7 +48,12 @@ class Placement(NamedTuple):
         cx = along_u * (camera.cx + 0.5) - 0.5 + left
         cy = along_v * (camera.cy + 0.5) - 0.5 + top
         return Camera(
-            along_u * camera.fx, along_v * camera.fy, cx, cy, *self.network
+            along_u * camera.fx,
+            along_v * camera.fy,
+            cx,
+            cy,
+            height=self.network[0],
+            width=self.network[1],
         )
 
     def crop(self, image: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ from hybridvo.core.geometry import invert
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.io.data.bags.messages import stamped_pose
 from hybridvo.io.data.bags.source import Bag
-from hybridvo.io.data.bags.topics import choose_gyroscope
 from hybridvo.io.data.open import open_sequence
 from hybridvo.io.ros.conversions import optical_mount, pose_in_odom
 
@@ -170,11 +169,7 @@ def used_topics(bag: Path) -> Used:
     topics = getattr(sequence, "topics", None)
     if topics is None:
         raise InputError(f"{bag}: expected a bag, got {sequence.kind}.")
-    imu = ""
-    if sequence.imu_samples is not None:
-        source = Bag(bag)
-        imu = choose_gyroscope(source.counts, source.types)
-        source.close()
+    imu = "" if sequence.imu_samples is None else topics.imu
     return Used(topics.rgb, topics.depth, topics.rgb_info, imu, len(sequence))
 
 

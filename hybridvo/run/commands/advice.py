@@ -49,8 +49,8 @@ ADVICE = {
         "with --depth-scale (units per metre)"
     ),
     Reason.NO_FLOW: (
-        "no flow could be computed, or the given one does not fit the images; see that images have "
-        "texture, and check the sign, the unit and the frames of your flow"
+        "no flow could be computed, or the given one does not fit the images; see that the images "
+        "are there and have texture, and check the sign, the unit and the frames of your flow"
     ),
     Reason.MISSING_FRAME: "the files cannot be read; the messages above name them",
     Reason.NOT_RIGID: "a moving object bends or falls apart; its mask holds, its motion does not",

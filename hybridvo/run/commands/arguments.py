@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 from argparse import SUPPRESS, Action, ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from hybridvo import __version__
 from hybridvo.core.errors import did_you_mean, printable
+from hybridvo.core.pages import page
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
 from hybridvo.run.commands import dispatch
 from hybridvo.run.commands.dispatch import CommandResult, calling, from_laboratory
@@ -39,6 +40,25 @@ KEY_WIDTH = 32
 """Width of the keys in what ``--set help`` prints, characters."""
 
 
+def with_negative_lists(words: Sequence[str]) -> list[str]:
+    """Return words with each list that begins with a minus joined to its option.
+
+    argparse takes such a list for an option.
+
+    Example:
+        >>> with_negative_lists(["run", "x", "--imu-rotation", "-0.5,0.5,-0.5,0.5"])
+        ['run', 'x', '--imu-rotation=-0.5,0.5,-0.5,0.5']
+    """
+    joined = list[str]()
+    for word in words:
+        is_of_option = bool(joined) and joined[-1].startswith("--")
+        if is_of_option and re.fullmatch(r"-[\d.e+-]+(,[\d.e+-]+)+", word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 class Parser(ArgumentParser):
     """A parser whose errors quote arguments without the characters that steer a terminal.
 
@@ -47,7 +67,8 @@ class Parser(ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse arguments, and refuse those that are left over."""
-        parsed, unknown = super().parse_known_args(args, namespace)
+        words = None if args is None else with_negative_lists(args)
+        parsed, unknown = super().parse_known_args(words, namespace)
         if unknown:
             self.error(
                 f"unrecognized arguments: {' '.join(unknown)}{self._near(unknown)}"
@@ -63,7 +84,7 @@ class Parser(ArgumentParser):
     def exit(self, status: int = 0, message: str | None = None) -> Any:
         """End the program; ``message`` goes to stderr."""
         if message:
-            message = printable(message)
+            message = printable(message.rstrip("\n")) + "\n"
         super().exit(status, message)
 
 
@@ -239,6 +260,15 @@ def reading(camera: str = CAMERA_HELP) -> tuple[Argument, ...]:
         word("--topic-depth TOPIC", "of depth, in a bag (default: guessed)"),
         word("--topic-info TOPIC", "of colour's CameraInfo (default: guessed)"),
         word("--topic-truth TOPIC", "of true poses (default: by its name)"),
+        word("--topic-imu TOPIC", "of the IMU, in a bag (default: guessed)"),
+        word(
+            "--imu-rotation x,y,z,w",
+            "quaternion from the axes of the IMU to the camera's (else /tf_static)",
+        ),
+        number(
+            "--depth-offset-ms MS",
+            "by how much the stamps of depth are late: subtracted before matching",
+        ),
         word("--depth-dir DIR", "depth of a video (default: depth beside)"),
         word(
             "--stereo METRES",
@@ -365,6 +395,10 @@ RUN = command(
     MODE,
     WEIGHTS,
     word("--out DIR", "output folder (default: runs/NAME)"),
+    word(
+        "--frame NAME",
+        "write the path of this frame, fixed to the camera by /tf_static, as base_link",
+    ),
     METHOD,
     MAX_FAILED,
     switch("--strict", "a broken frame ends the run", default=None),
@@ -461,7 +495,7 @@ COMPARE = command(
     ),
     word(
         "--protocol",
-        "score a data set as papers do: docs/protocols.md",
+        f"score a data set as papers do: {page('protocols')}",
         choices=PROTOCOLS,
     ),
     JOBS,
@@ -672,7 +706,7 @@ def build_parser() -> ArgumentParser:
     for command in COMMANDS:
         _add(commands, command)
     train = commands.add_parser(
-        "train", help=TRAIN, description=f"{TRAIN} See docs/training.md."
+        "train", help=TRAIN, description=f"{TRAIN} See {page('training')}."
     )
     tasks = train.add_subparsers(dest="training", required=True, metavar="COMMAND")
     for command in TRAINING_COMMANDS:

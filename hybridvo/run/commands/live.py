@@ -301,7 +301,8 @@ class _Files(contextlib.AbstractContextManager):
         if present and not overwrite:
             names = ", ".join(present[:3])
             raise InputError(
-                f"{folder}: holds results ({names}). Pass --overwrite, or another --out."
+                f"{folder}: holds results ({names}). Pass another --out, or "
+                "--overwrite to delete them first."
             )
         self._folder = folder
         self._header = header
@@ -412,7 +413,7 @@ class _Screen(contextlib.AbstractContextManager):
 
     def say(self, text: str) -> None:
         """Show a sentence above the line."""
-        text = printable(text, keep="")
+        text = printable(text)
         self.messages.append(text)
         self._console.print(text)
 

@@ -23,7 +23,9 @@ def command_that_shows(args: Namespace, frame: int) -> str:
 
     reading = inspect.signature(open_sequence).parameters
     words = ["hybridvo", "show", str(args.sequence)]
-    for name in (*reading, "flow", "method"):
+    # '--frame' of 'show' names another thing
+    names = [name for name in reading if name != "frame"]
+    for name in (*names, "flow", "method"):
         words += _option(name, getattr(args, name, None))
     for weights in getattr(args, "weights", []):
         words += ["--weights", weights]

@@ -66,7 +66,7 @@ def times_after_passes(
         InputError: A frame cannot be read, and ``run.strict`` is set.
     """
     console = Console(stderr=True, quiet=quiet, markup=False, highlight=False)
-    name = printable(sequence.name, keep="")
+    name = printable(sequence.name)
     times = PixelTimes()
     with Progress(console=console) as bar, stop_requested() as stop:
         for number, finder in enumerate(finders(passes)):

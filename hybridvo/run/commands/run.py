@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import dataclasses
 import re
 import time
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -21,7 +19,6 @@ from rich.markup import escape
 from rich.progress import Progress
 
 from hybridvo.core import laboratory
-from hybridvo.core.belief import Belief
 from hybridvo.core.errors import InputError, OutputError, printable
 from hybridvo.core.files import (
     Mode,
@@ -33,7 +30,6 @@ from hybridvo.core.files import (
     write_json,
 )
 from hybridvo.core.geometry import invert
-from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import NETWORK, Options, RunOptions
 from hybridvo.core.results import Edge, RelativePose, Step, stated_sigmas
 from hybridvo.core.stages import stage, stage_summary, stage_times
@@ -48,7 +44,6 @@ from hybridvo.io.viewer.recording import RecordingWriter, check_recording
 from hybridvo.io.viewer.scene import Seen, Sink, position_covariance
 from hybridvo.io.viewer.viewer import Viewer
 from hybridvo.network.models import Models
-from hybridvo.objects.followed import Thing, Things
 from hybridvo.odometry import Odometry
 from hybridvo.pipeline import check_method
 from hybridvo.run.commands.advice import advice_on, likely_causes
@@ -74,24 +69,18 @@ from hybridvo.run.commands.run_folder import (
     RunFolder,
     weights_hash,
 )
+from hybridvo.run.commands.run_hints import hint_of_run, next_command
 from hybridvo.run.commands.stopping import stop_requested
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo.run.commands.terminal import STYLES
-from hybridvo.tracking.accelerometer import Accelerometer
+from hybridvo.run.commands.text import text_of
 from hybridvo.tracking.chains import PathCovariance
 from hybridvo.tracking.depth_scale import (
-    ScaleFilter,
     common_scales,
-    divided,
     in_one_scale,
     scale_factors,
 )
-from hybridvo.tracking.gyroscope import Gyroscope
-from hybridvo.tracking.keyframes import Keyframe
-from hybridvo.tracking.memory import Memory
-from hybridvo.tracking.motion_model import MotionModel
 from hybridvo.tracking.passes import PixelTimes, TimesFinder
-from hybridvo.tracking.stamps import Clock
-from hybridvo.tracking.tracker_state import Sensors, TrackerState
 
 ARRAYS = (
     "index",
@@ -105,27 +94,6 @@ ARRAYS = (
     "edge_covariance",
 )
 """The columns of the steps that ``steps.npz`` holds."""
-STATE_CLASSES = {
-    kind.__name__: kind
-    for kind in (
-        TrackerState,
-        Sensors,
-        MotionModel,
-        Keyframe,
-        ScaleFilter,
-        Clock,
-        Memory,
-        Belief,
-        Gyroscope,
-        Accelerometer,
-        ImuSamples,
-        Things,
-        Thing,
-    )
-}
-"""The classes that make up a tracker's state, beside frames and arrays."""
-LONG_ARRAY = 64
-"""Numbers from which an array is packed: the state is written after every frame."""
 RUN_FIELDS = (
     "method",
     "degraded",
@@ -219,7 +187,10 @@ def run(
         if mode == "overwrite":
             clear_export(out)
         summary = folder.summary
-        if summary is None:
+        if summary is not None:
+            with folder.stored_is_whole():
+                _check_summary(summary)
+        else:
             times = PixelTimes()
             if options.run.passes > 1:
                 earlier = options.run.passes - 1
@@ -261,6 +232,13 @@ def run(
             summary["export"] = exporter.finish()
     too_many_failed = summary["failed_fraction"] > options.run.max_failed
     return summary, 3 if too_many_failed else 0
+
+
+def _check_summary(summary: dict[str, Any]) -> None:
+    """Raise an exception of any kind where nobody could print a summary that a folder holds."""
+    float(summary["failed_fraction"])
+    has_frame = summary["least_sure"] is not None
+    text_of("run", summary | {"next": "a command" if has_frame else ""})
 
 
 def _with_method(options: Options, method: str) -> Options:
@@ -312,57 +290,6 @@ def _header(
     }
 
 
-# -- the state of a tracker, on disk -----------------------------------------------------
-
-
-def saved(value: Any) -> Any:
-    """Return a tracker's state, or a part of it, for JSON.
-
-    A frame becomes its index, because its files are on disk. Classes, arrays and frames become
-    dictionaries, tuples become lists.
-    """
-    if isinstance(value, Frame):
-        return {"frame": value.index, "depth_scale": value.depth_scale}
-    if isinstance(value, np.ndarray) and value.size > LONG_ARRAY:
-        packed = zlib.compress(np.ascontiguousarray(value).tobytes(), level=1)
-        return {
-            "packed": base64.b64encode(packed).decode(),
-            "shape": list(value.shape),
-            "dtype": str(value.dtype),
-        }
-    if isinstance(value, np.ndarray):
-        return {"array": value.tolist(), "dtype": str(value.dtype)}
-    if isinstance(value, list | tuple):
-        return [saved(part) for part in value]
-    name = type(value).__name__
-    if name in STATE_CLASSES:
-        fields = {key: saved(part) for key, part in vars(value).items()}
-        return {"state": name, **fields}
-    return value
-
-
-def restored(value: Any, sequence: Sequence) -> Any:
-    """Return what :func:`saved` was given; lists become tuples, frames are read again."""
-    if isinstance(value, list):
-        return tuple(restored(part, sequence) for part in value)
-    if not isinstance(value, dict):
-        return value
-    if "state" in value:
-        fields = {
-            name: restored(part, sequence)
-            for name, part in value.items()
-            if name != "state"
-        }
-        return STATE_CLASSES[value["state"]](**fields)
-    if "frame" in value:
-        return divided(sequence.frame(value["frame"]), value["depth_scale"])
-    if "packed" in value:
-        data = zlib.decompress(base64.b64decode(value["packed"]))
-        flat = np.frombuffer(data, dtype=value["dtype"])
-        return flat.reshape(value["shape"]).copy()
-    return np.array(value["array"], dtype=value["dtype"])
-
-
 @contextlib.contextmanager
 def _interruption_is_kept(folder: RunFolder) -> Iterator[None]:
     """Let ``run.json`` state that a run was interrupted, where a part of it raises."""
@@ -405,7 +332,7 @@ class _Run:
 
     def estimate_and_write(self, quiet: bool, picture: bool) -> dict[str, Any]:
         """Track the frames and write the results; returns their summary, JSON-ready."""
-        with _interruption_is_kept(self.folder):
+        with _interruption_is_kept(self.folder), self.folder.stored_is_whole():
             self.estimate(quiet)
             summary = self.write_results(picture)
         self.folder.save("done", summary=summary)
@@ -419,7 +346,7 @@ class _Run:
         console = Console(
             stderr=True, quiet=quiet, soft_wrap=True, markup=False, highlight=False
         )
-        name = printable(self.sequence.name, keep="")
+        name = printable(self.sequence.name)
         # In rich's markup, square brackets are tags.
         label = escape(f"{name} [{self.tracker.method}]")
 
@@ -547,6 +474,8 @@ class _Run:
                 folder / OBJECTS, [each for row in rows for each in row["objects"]]
             )
         summary["passes"] = options.passes
+        if "frame" in self.sequence.chosen:
+            summary["frame"] = self.sequence.chosen["frame"]
         times = self.finder.found()
         if times.readout is not None and times.readout_is_known:
             summary["readout_ms"] = times.readout_ms
@@ -574,6 +503,18 @@ class _Run:
                 states=steps["status"].tolist(),
                 covariances=_position_covariances(steps),
             )
+        hint = hint_of_run(
+            self.sequence,
+            self.folder.rows,
+            summary.get("readout_ms", 0.0),
+            options.passes,
+        )
+        if hint is not None:
+            words = self.folder.header["command"]
+            summary["likely"] = {
+                "cause": hint.cause,
+                "command": next_command(words, self.sequence, hint, folder),
+            }
         existing = [
             folder / name for name in (*RESULTS, STATE) if (folder / name).exists()
         ]
@@ -585,7 +526,7 @@ class _Run:
         }
 
     def _write_trajectory(self, steps: pd.DataFrame) -> Trajectory:
-        """Write the path and the motions of a run; returns the path."""
+        """Write the path and the motions of a run; returns the path of the camera."""
         folder = self.folder.path
         columns: dict[str, Any] = {
             name: np.array(steps[name].tolist()) for name in ARRAYS
@@ -601,8 +542,11 @@ class _Run:
             ),
         )
         trajectory = Trajectory(columns["timestamp"], poses)
-        trajectory.save(folder / "trajectory.tum")
-        trajectory.save(folder / "trajectory.kitti")
+        written = trajectory
+        if self.sequence.T_cam_frame is not None:
+            written = trajectory.of_frame(self.sequence.T_cam_frame)
+        written.save(folder / "trajectory.tum")
+        written.save(folder / "trajectory.kitti")
         with atomic_write(folder / "steps.npz", "wb") as file:
             np.savez(file, **columns)
         return trajectory

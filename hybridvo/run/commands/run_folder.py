@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -13,7 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from hybridvo.core.errors import FormatError, InputError
+from hybridvo.core.errors import FormatError, HybridVOError, InputError
 from hybridvo.core.files import (
     Journal,
     LineFile,
@@ -74,7 +75,8 @@ DECIDING = (
 """Beginnings of the keys in ``run.json`` that must be equal in a resumed run."""
 FREE = ("options.run.max_failed", "options.run.strict", "options.run.device")
 """Keys among them that may differ."""
-REMEDY = "Pass --overwrite to start anew"
+REMEDY = "Start anew in another folder: --out DIR (--overwrite deletes the results in this one)"
+"""What helps where a run cannot be resumed: the way that loses nothing first."""
 
 
 class RunFolder:
@@ -108,21 +110,44 @@ class RunFolder:
         self.tracker: Any = None
         self.summary: dict[str, Any] | None = None
         present = self._present()
+        self._is_resumed = bool(present) and mode == "resume"
         if present and mode == "new":
             names = ", ".join(present[:3])
-            choices = (
-                "--overwrite to replace them, --resume to go on, or another --out"
-            )
+            choices = "--resume to go on, another --out, or --overwrite to delete them first"
             raise InputError(f"{path}: holds results ({names}). Pass {choices}.")
         is_unfinished = False
         if present and mode == "resume":
             before = self._state_before()
-            if before["state"] == "done":
-                self.summary = self._checked_summary(before["summary"])
-            else:
-                is_unfinished = True
+            with self.stored_is_whole():
+                if before["state"] == "done":
+                    self.summary = self._checked_summary(before["summary"])
+                else:
+                    is_unfinished = True
         if self.summary is None:
             self._open(is_unfinished)
+
+    @contextlib.contextmanager
+    def stored_is_whole(self) -> Iterator[None]:
+        """Name the folder where a resumed run fails as only one does that holds nonsense.
+
+        Checksums find damage. What a stranger has made up has the right ones, and may be of any
+        type and value.
+
+        Raises:
+            InputError: In place of any exception that is no answer to input; it bears that one.
+        """
+        try:
+            yield
+        except (HybridVOError, OSError):
+            raise
+        except Exception as error:
+            if not self._is_resumed:
+                raise
+            reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+            raise InputError(
+                f"{self.path}: cannot be resumed: what it holds of the run before is no such run "
+                f"({reason}). {REMEDY}."
+            ) from error
 
     def add(self, row: dict[str, Any], tracker: Any) -> None:
         """Keep the row of one more frame, and the tracker's state after it."""
@@ -171,10 +196,9 @@ class RunFolder:
                 if key == "input_hash":
                     recording = before.get("sequence", "unknown")
                     problem = f"the files are not those of the run, which read {recording}"
-                started = shlex.join(before.get("command", []))
                 raise InputError(
-                    f"{self.path}: cannot be resumed: {problem}. {REMEDY}, or resume the run "
-                    f"as it was started: {started or 'by a program'}."
+                    f"{self.path}: cannot be resumed: {problem}. "
+                    f"{_resumed_as_started(before)}{REMEDY}."
                 )
         return before
 
@@ -232,13 +256,27 @@ class RunFolder:
             raise InputError(
                 f"{error} The run cannot be resumed. {REMEDY}."
             ) from None
-        for row, tracker in self._checkpoint.values:
-            self.rows.append(row)
-            self.tracker = tracker
+        with self.stored_is_whole():
+            for row, tracker in self._checkpoint.values:
+                self.rows.append(row)
+                self.tracker = tracker
+            lines = list(_csv_lines(self.rows))
         self.save("running")
         if not self.rows:
             remove(*(self.path / name for name in (*RESULTS, LIVE_STEPS)))
-        self._steps = LineFile(self.path / STEPS, _csv_lines(self.rows))
+        self._steps = LineFile(self.path / STEPS, lines)
+
+
+def _resumed_as_started(before: Mapping[str, Any]) -> str:
+    """The sentence that tells how a run is resumed as it was started; empty of a program's."""
+    words = [str(word) for word in before.get("command", [])]
+    # of which --overwrite would delete the run
+    kept = [word for word in words[1:] if word not in ("--overwrite", "--resume")]
+    if not kept:
+        return ""
+    # whatever the file names, it is this program
+    command = shlex.join(["hybridvo", *kept, "--resume"])
+    return f"Resume it as it was started: {command} . Or: "
 
 
 def _deciding(header: Mapping[str, Any]) -> dict[str, str]:

@@ -38,7 +38,7 @@ TEXT_COLUMNS = (
 def printable_content(content: Any) -> Any:
     """Return the result of a command with every text in it on one line and printable."""
     if isinstance(content, str):
-        return printable(content, keep="")
+        return printable(content)
     if isinstance(content, dict):
         return {
             printable_content(key): printable_content(value)

@@ -74,6 +74,8 @@ def _run_text(content: Content) -> list[str]:
         _labelled("method", content["method"]),
         _labelled("inputs", f"flow: {flow}; depth: {content['depth_source']}"),
     ]
+    if content.get("frame"):
+        lines.append(_labelled("path of", f"'{content['frame']}' (trajectory.tum)"))
     if content["oracle"]:
         oracle = " and ".join(content["oracle"])
         lines.append(_labelled("ORACLE", f"uses {oracle} (ground truth)"))
@@ -96,6 +98,10 @@ def _run_text(content: Content) -> list[str]:
     if export:
         text = f"{export['folder']} ({', '.join(export['kinds'])})"
         lines.append(_labelled("export", text))
+    if content.get("likely"):
+        likely = content["likely"]
+        lines.append(_labelled("likely cause", likely["cause"]))
+        lines.append(_labelled("try", likely["command"]))
     if content.get("next"):
         lines += _next(content["least_sure"], content["next"])
     return lines

@@ -813,3 +813,136 @@ def test_the_commands_take_a_bag(
     compared = ["compare", *given, "--methods", "identity"]
     assert main([*compared, "--out", str(tmp_path / "compared")]) == 0
     assert build_parser().parse_args(["doctor", *given]).topic_rgb == bags.RGB
+
+
+# -- an inertial sensor, a clock and a body beside the camera ------------------------------
+
+IMU_XYZW = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+"""A quarter turn about z, from the axes of the IMU to those of ``base``."""
+RATES = (0.3, 0.0, 0.0)
+
+
+def robot(
+    root: Path,
+    imu: str,
+    frame: str = "imu",
+    depth_late_ns: int = 0,
+    tf: bool = True,
+) -> Path:
+    """A bag of a camera and an IMU on a base, and depth whose clock may be late."""
+    writer = bags.Writer(root, "mcap")
+    if tf:
+        fixed = writer.tf(
+            writer.transform("base_link", "color", (0.2, 0, 0), (0, 0, 0, 1)),
+            writer.transform("base_link", "imu", (0, 0.1, 0), IMU_XYZW),
+        )
+        writer.write("/tf_static", fixed, bags.START)
+    for i in range(bags.FRAMES):
+        time = bags.stamp(i)
+        writer.write(bags.INFO, writer.info(), time)
+        writer.write(bags.RGB, writer.image(bags.rgb(i), "rgb8", time), time + 1)
+        late = time + depth_late_ns
+        depth = writer.image(bags.millimetres(i), "16UC1", late)
+        writer.write(bags.DEPTH, depth, late + 2)
+    for k in range(20):
+        time = bags.START + k * 10_000_000
+        zero = np.zeros(9)
+        message = writer.make(
+            "sensor_msgs/msg/Imu",
+            header=writer.header(time, frame),
+            orientation=writer.quaternion((0, 0, 0, 1)),
+            orientation_covariance=zero,
+            angular_velocity=writer.vector(RATES),
+            angular_velocity_covariance=zero,
+            linear_acceleration=writer.vector((0, 0, 0)),
+            linear_acceleration_covariance=zero,
+        )
+        for topic in (imu, "/other/imu"):
+            if topic == imu or k % 2:
+                writer.write(topic, message, time + 3)
+    return writer.close()
+
+
+@pytest.mark.parametrize(
+    "topic", ["/imu/data", "/oak/imu/data", "/oak/imu", "/imu"]
+)
+def test_an_imu_is_used_whatever_its_topic_is_called(
+    topic: str, tmp_path: Path
+) -> None:
+    path = robot(tmp_path, topic)
+    sequence = open_sequence(path)
+    assert sequence.topics.imu == topic
+    assert f"IMU {topic}" in sequence.warnings[0]
+    samples = sequence.imu(sequence.timestamps[0], sequence.timestamps[1])
+    assert samples is not None
+    turned = samples.rates[0] @ samples.R_cam_imu.T
+    np.testing.assert_allclose(turned, (0, 0.3, 0), atol=1e-9)
+    assert open_sequence(path, topic_imu="/other/imu").topics.imu == "/other/imu"
+    said = refused(path, topic_imu=bags.RGB)
+    assert "--topic-imu" in said and topic in said
+
+
+def test_topics_names_the_gyroscope(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = robot(tmp_path, "/imu/data")
+    assert main(["topics", str(path), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["topics"]
+    taken = {row["name"]: row["taken_for"] for row in rows}
+    assert taken["/imu/data"] == "gyroscope" and taken["/other/imu"] == ""
+
+
+def test_the_rotation_of_an_imu_without_transforms_is_stated(
+    tmp_path: Path,
+) -> None:
+    path = robot(tmp_path, "/imu/data", frame="", tf=False)
+    sequence = open_sequence(path)
+    assert sequence.imu_samples is None
+    assert "--imu-rotation" in " ".join(sequence.warnings)
+    quarter = ",".join(str(value) for value in IMU_XYZW)
+    sequence = open_sequence(path, imu_rotation=quarter)
+    turned = sequence.imu(*sequence.timestamps[:2])
+    assert turned is not None
+    np.testing.assert_allclose(turned.R_cam_imu @ RATES, (0, 0.3, 0), atol=1e-9)
+    # of the two quaternions of a rotation, the one that begins with a minus
+    opposite = ",".join(str(-value) for value in (0.5, 0.5, -0.5, 0.5))
+    args = build_parser().parse_args(["run", "x", "--imu-rotation", opposite])
+    assert args.imu_rotation == opposite
+    for wrong in ("0,0,0", "1,1,1,1", "a,b,c,d"):
+        assert "x,y,z,w" in refused(path, imu_rotation=wrong)
+
+
+@pytest.mark.parametrize("trust", [True, False])
+def test_depth_of_a_late_clock_is_matched(trust: bool, tmp_path: Path) -> None:
+    late_ms = 100.0
+    path = robot(tmp_path, "/imu", depth_late_ns=int(1e6 * late_ms))
+    sequence = open_sequence(path, depth_offset_ms=late_ms, trust=trust)
+    assert len(sequence) == bags.FRAMES
+    np.testing.assert_allclose(
+        sequence.depth_timestamps, sequence.timestamps, atol=1e-6
+    )
+    for i in range(bags.FRAMES):
+        np.testing.assert_allclose(sequence[i].depth, bags.millimetres(i) / 1000)
+    assert sequence.opened_with()["depth_offset_ms"] == "100.0"
+    # without it, three frames later
+    assert len(open_sequence(path, trust=trust)) < bags.FRAMES
+
+
+def test_the_path_of_the_base_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = robot(tmp_path, "/imu")
+    T = np.eye(4)
+    T[0, 3] = -0.2
+    np.testing.assert_allclose(
+        open_sequence(path, frame="/base_link").T_cam_frame, T
+    )
+    command = ["run", str(path), "-q", "--method", "identity", "--frame"]
+    out = ["--out", str(tmp_path / "out")]
+    assert (
+        main([*(word for word in command if word != "-q"), "base_link", *out]) == 0
+    )
+    assert "path of" in capsys.readouterr().out
+    said = refused(path, frame="map")
+    assert "--frame map" in said and "'color'" in said and "base_link" in said
+    assert main([*command, "map", "--out", str(tmp_path / "no")]) == 2

@@ -5,10 +5,13 @@ from __future__ import annotations
 import bz2
 import json
 import os
+import signal
 import sqlite3
 import struct
+import subprocess
 import sys
 import tempfile
+import time
 import tracemalloc
 import zipfile
 from collections.abc import Iterator
@@ -312,9 +315,10 @@ def test_packed_bags_are_recognised_and_read(
         assert list(scratch.iterdir())
         (packed,) = path.glob("*.zstd")
         assert packed in sequence.files()
-        np.testing.assert_array_equal(open_sequence(packed)[1].rgb, bags.rgb(1))
     del sequence
     assert not list(scratch.iterdir())
+    if mode == "file":
+        np.testing.assert_array_equal(open_sequence(packed)[1].rgb, bags.rgb(1))
 
 
 def test_a_packed_file_that_would_fill_the_disk(
@@ -326,13 +330,74 @@ def test_a_packed_file_that_would_fill_the_disk(
     assert "more than a recording does" in refusal(path)
     # it states nothing
     packed.write_bytes(zstd_bomb())
-    assert "cannot be unpacked" in refusal(path)
+    assert "more than a recording does" in refusal(path)
+
+
+@pytest.mark.usefixtures("read_here")
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_packed_files_that_fill_the_disk_together(
+    is_stated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    path = packed_bag(tmp_path, "sqlite3", "file")
+    (path / "metadata.yaml").unlink()
+    (packed,) = path.glob("*.zstd")
+    # each by itself is a recording of a useful size
+    plain = zstd.decompress(packed.read_bytes()).ljust(40 * MEGABYTE, b"\0")
+    content = zstd.compress(plain)
+    if not is_stated:
+        packer = zstd.ZstdCompressor()
+        content = packer.compress(plain) + packer.flush()
+    for number in range(4):
+        (path / f"part_{number}.db3.zstd").write_bytes(content)
+    said = refusal(path)
+    assert "of all packed files of the bag" in said
+    assert not list(scratch.iterdir())
 
 
 def test_a_packed_message_that_unpacks_to_a_gigabyte(tmp_path: Path) -> None:
     path = packed_bag(tmp_path, "sqlite3", "message")
     changed(path, "UPDATE messages SET data = ?", zstd_bomb())
     assert "no frames" in refusal(path)
+
+
+HOLDS_A_BAG = """
+import os, sys
+from pathlib import Path
+from hybridvo import open_sequence
+sequence = open_sequence(sys.argv[1])
+print(sequence._child._forked.pid, flush=True)
+sys.stdin.readline()
+"""
+
+
+@pytest.mark.skipif(not limits.is_available(), reason="no child process here")
+@pytest.mark.parametrize("killed", ["child", "process", "nothing"])
+def test_what_was_unpacked_is_removed_whoever_is_killed(
+    killed: str, tmp_path: Path
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    path = packed_bag(tmp_path, "sqlite3", "file")
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDS_A_BAG, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"TMPDIR": str(scratch)},
+    )
+    assert process.stdin is not None and process.stdout is not None
+    with process:
+        child = int(process.stdout.readline())
+        assert list(scratch.rglob("*.db3"))
+        if killed != "nothing":
+            os.kill(child if killed == "child" else process.pid, signal.SIGKILL)
+        process.stdin.close()
+    deadline = time.monotonic() + 20
+    while list(scratch.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not list(scratch.iterdir())
 
 
 # -- databases -----------------------------------------------------------------------

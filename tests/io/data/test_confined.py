@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import platform
 import signal
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from hybridvo import Camera, InputError, open_sequence
 from hybridvo.core.errors import FormatError
 from hybridvo.io.data.bags.reader import BagSequence
-from hybridvo.io.data.confined import fork_server, limits, wire
+from hybridvo.io.data.confined import fork_server, limits, syscalls, wire
 from hybridvo.io.data.confined import sequence as confined
 from hybridvo.io.data.confined.sequence import ConfinedSequence, ReaderStopped
 from hybridvo.io.data.sequence import Sequence
@@ -52,7 +53,9 @@ def check_alike(one: Sequence, other: Sequence) -> None:
 def test_a_bag_is_read_alike_in_a_child(kind: str, tmp_path: Path) -> None:
     path = bags.plain_bag(tmp_path, kind)
     given = {
-        "camera": Camera(*bags.K, *bags.SIZE, readout_ms=3),
+        "camera": Camera(
+            *bags.K, height=bags.SIZE[0], width=bags.SIZE[1], readout_ms=3
+        ),
         "depth_scale": 0.5,
     }
     for options in ({}, given):
@@ -184,6 +187,21 @@ def test_files_are_limited(deed: str, tmp_path: Path) -> None:
     written = tmp_path / "large"
     assert not written.exists() or written.stat().st_size <= 80 * limits.MIB
     assert int(sequence.frame(3).rgb[0, 0, 0]) == 3
+
+
+@pytest.mark.skipif(
+    platform.machine() not in syscalls.MACHINES, reason="another processor"
+)
+@pytest.mark.parametrize("deed", ["connect", "run_program", "take_over"])
+def test_a_child_reaches_nothing_but_files(deed: str, tmp_path: Path) -> None:
+    sequence = evil(tmp_path, deed)
+    with pytest.raises(PermissionError, match="not permitted"):
+        sequence.frame(BAD)
+    assert int(sequence.frame(3).rgb[0, 0, 0]) == 3
+
+
+def test_a_child_has_threads(tmp_path: Path) -> None:
+    assert int(evil(tmp_path, "thread").frame(BAD).rgb[0, 0, 0]) == BAD
 
 
 def test_a_file_that_is_mapped_takes_no_memory(tmp_path: Path) -> None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
 import hybridvo as hvo
 from hybridvo.core.errors import InputError
-from hybridvo.core.types import Camera
+from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.lists import poses_at
 from hybridvo.io.data.open import iter_pairs, open_sequence
 from hybridvo.io.data.resize import resize_camera, resize_frame
+from tests import bags
 from tests import sequences as write
 from tests.doors import refuses
 
@@ -128,7 +130,7 @@ def test_intrinsics_of_open3d_and_numpy(mine):
     for content in (intrinsic, {"extrinsic": [1.0] * 16, "intrinsic": intrinsic}):
         path.write_text(json.dumps(content))
         assert open_sequence(mine, camera=path).camera(0) == Camera(
-            20, 21, 4.5, 2.5, 6, 10
+            20, 21, 4.5, 2.5, height=6, width=10
         )
     by_rows = np.reshape(MATRIX, (3, 3)).T
     path.write_text(
@@ -138,7 +140,7 @@ def test_intrinsics_of_open3d_and_numpy(mine):
     path = mine.parent / "K.npy"
     np.save(path, by_rows)
     assert open_sequence(mine, camera=path).camera(0) == Camera(
-        20, 21, 4.5, 2.5, 6, 10
+        20, 21, 4.5, 2.5, height=6, width=10
     )
     np.save(path, by_rows.T)
     assert "[fx, 0, cx]" in refused(mine, camera=path)
@@ -170,7 +172,11 @@ def test_recordings_that_are_known_are_named_with_what_to_do(
 
 # arguments
 
-TINY = {"rgb": None, "depth": np.ones((4, 5)), "camera": Camera(9, 9, 2, 2, 4, 5)}
+TINY = {
+    "rgb": None,
+    "depth": np.ones((4, 5)),
+    "camera": Camera(9, 9, 2, 2, height=4, width=5),
+}
 
 test_arguments = refuses(
     [
@@ -211,3 +217,43 @@ def test_arguments_of_pairs(arguments, word, tmp_path):
     assert len(list(iter_pairs(sequence, start=np.int64(1), stop=np.int64(3)))) == 1
     with pytest.raises(InputError, match="one frame"):
         sequence[0:2]
+
+
+def test_a_folder_beside_recordings_is_no_part_of_them(tmp_path):
+    K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
+    rgb = np.zeros((3, 12, 16, 3), np.uint8)
+    np.savez(tmp_path / "walk.npz", rgb=rgb, depth=np.ones((3, 12, 16)), K=K)
+    bags.plain_bag(tmp_path, "mcap")
+    (tmp_path / "drive" / "drive.mcap").rename(tmp_path / "drive.mcap")
+    captures = tmp_path / "captures"
+    captures.mkdir()
+    for names in ((), ("color_0.png", "depth_0.png")):
+        for name in names:
+            cv2.imwrite(str(captures / name), rgb[0])
+        with pytest.raises(InputError) as caught:
+            open_sequence(captures)
+        assert "folder above" not in str(caught.value)
+        assert "rgb/" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((640, 480), ("Camera(height=640, width=480)?", "mirror")),
+        ((240, 320), ("registered", "register_depth")),
+    ],
+)
+def test_depth_of_another_size_names_what_helps(shape, words):
+    camera = Camera(fx=500, fy=500, cx=319.5, cy=239.5, height=480, width=640)
+    rgb = np.zeros((480, 640, 3), np.uint8)
+    with pytest.raises(InputError) as caught:
+        Frame(rgb, np.ones(shape, np.float32), camera)
+    said = str(caught.value)
+    assert all(word in said for word in words)
+    assert "transpose it:" not in said and "Resize" not in said
+
+
+def test_an_image_of_another_size_names_the_camera():
+    camera = Camera(fx=500, fy=500, cx=319.5, cy=239.5, height=480, width=640)
+    with pytest.raises(InputError, match=r"resize_camera"):
+        Frame(np.zeros((240, 320, 3), np.uint8), None, camera)

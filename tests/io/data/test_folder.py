@@ -286,7 +286,7 @@ def test_camera_files_of_others(text, tmp_path):
     path.write_text(text)
     told: list[str] = []
     found = read_camera_file(path, told)
-    assert found.camera == Camera(20, 21, 15.5, 11.5, 24, 32)
+    assert found.camera == Camera(20, 21, 15.5, 11.5, height=24, width=32)
     assert any(found.distortion) == (text is ROS) == bool(told)
     for model in ("equidistant", "rational_polynomial"):
         path.write_text(ROS.replace("plumb_bob", model))
@@ -303,7 +303,7 @@ def test_a_camera_may_be_given_to_every_reader(tmp_path):
         sequence = open_sequence(writer(tmp_path / kind).path)
         height, width = sequence.height, sequence.width
         words = f"99,98,{width / 2},{height / 2}"
-        expected = Camera(99, 98, width / 2, height / 2, height, width)
+        expected = Camera(99, 98, width / 2, height / 2, height=height, width=width)
         path.write_text(
             f"{{fx: 99, fy: 98, cx: {width / 2}, cy: {height / 2}, width: {width}, "
             f"height: {height}}}"
@@ -314,7 +314,7 @@ def test_a_camera_may_be_given_to_every_reader(tmp_path):
             )
             assert opened.camera(1) == opened[1].camera == expected
     for camera, message in (
-        (Camera(9, 9, 4, 3, 6, 8), "8x6"),
+        (Camera(9, 9, 4, 3, height=6, width=8), "8x6"),
         ("1,2,3", "neither four numbers nor a file"),
         ("-1,2,3,4", "focal length"),
     ):
@@ -351,7 +351,9 @@ def test_template_is_filled_in_and_read(tmp_path):
     for key, value in values.items():
         text = text.replace(f"\n{key}:", f"\n{key}: {value}")
     path.write_text(text)
-    assert open_sequence(root)[0].camera == Camera(16.5, 16.5, 16.5, 16.5, 24, 32)
+    assert open_sequence(root)[0].camera == Camera(
+        16.5, 16.5, 16.5, 16.5, height=24, width=32
+    )
     with pytest.raises(InputError, match="exists already"):
         write_camera_template(root)
 

@@ -17,6 +17,7 @@ from hybridvo.core.types import Camera
 from hybridvo.io.data import image_io as io
 from hybridvo.io.data.camera_file import read_camera_file
 from hybridvo.io.data.open import open_sequence
+from hybridvo.run.cli import main
 from tests import sequences as write
 
 # what can be printed
@@ -27,10 +28,27 @@ def test_messages_hold_nothing_that_a_terminal_obeys():
     plain = "a\\x1b]0;owned\\x07\\x9b2J\\rb\\u202e\\udcff\N{CAMERA} ü"
     assert printable(name) == plain
     for kind in (InputError, FormatError, OutputError):
-        assert (
-            str(kind(f"{name}: no.\nSecond line.")) == f"{plain}: no.\nSecond line."
-        )
+        assert str(kind(f"{name}: no.")) == f"{plain}: no."
     assert printable(plain) == plain  # a message may pass twice
+
+
+def test_a_name_makes_no_line_of_its_own(tmp_path, caplog, capsys):
+    forged = "a\nhybridvo: all is well\tb"
+    plain = "a\\nhybridvo: all is well\\tb"
+    assert printable(forged) == plain
+    assert str(InputError(forged)) == plain
+    path = write.WRITERS["folder"](tmp_path / "plain").path.rename(
+        tmp_path / forged
+    )
+    sequence = open_sequence(path)
+    sequence.rgb_files[1].unlink()
+    told = [sequence.name, *open_sequence(path).warnings]
+    assert plain in told[0] and len(told) > 1
+    assert not any("\n" in text for text in told)
+    assert main(["run", str(tmp_path / "no" / forged)]) == 2
+    assert plain in capsys.readouterr().err
+    assert main(["run", f"--{forged}"]) == 2
+    assert "\nhybridvo: all is well" not in capsys.readouterr().err
 
 
 def test_messages_are_cut():
@@ -201,6 +219,33 @@ def test_images_of_one_value_are_whole_though_they_are_small(image, tmp_path):
         colours = image[:, :, :3] if image.ndim == 3 and ending == ".jpg" else image
         path.write_bytes(cv2.imencode(ending, colours, options)[1].tobytes())
         assert io.read_rgb(path).shape[:2] == image.shape[:2] == io.image_size(path)
+
+
+def test_the_file_of_a_matrix_holds_a_matrix_alone(tmp_path):
+    path = tmp_path / "1.txt"
+    path.write_text("1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1\n")
+    np.testing.assert_array_equal(io.read_matrix(path), np.eye(4))
+    path.write_text("1 " * 10_000)
+    with pytest.raises(FormatError, match="at most 4096 bytes"):
+        io.read_matrix(path)
+
+
+@pytest.mark.parametrize("count", [2, 200])
+def test_a_jpeg_of_many_scans(count, tmp_path):
+    """Each scan is some bytes, and a walk of the decoder over all of the image."""
+    image = np.full((48, 64, 3), 90, np.uint8)
+    progressive = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    whole = cv2.imencode(".jpg", image, progressive)[1].tobytes()
+    last = whole[whole.rindex(b"\xff\xda") : -2]
+    path = tmp_path / "a.jpg"
+    path.write_bytes(whole[:-2] + count * last + whole[-2:])
+    if count == 2:
+        np.testing.assert_allclose(io.read_rgb(path), image, atol=3)
+        return
+    with pytest.raises(FormatError, match="at most 100 scans"):
+        io.read_rgb(path)
+    with pytest.raises(FormatError, match="at most 100 scans"):
+        io.decode_bytes(path.read_bytes(), cv2.IMREAD_COLOR, "a topic")
 
 
 def test_notes_before_the_size_of_a_jpeg(tmp_path):
@@ -453,4 +498,4 @@ def test_a_huge_number_in_a_name_costs_nothing(kind, pattern, tmp_path):
 @pytest.mark.parametrize("size", ["-8", "x", "0", "9" * 400])
 def test_a_size_that_is_text_is_one_line(size: str) -> None:
     with pytest.raises(InputError, match="height: expected a positive integer"):
-        Camera(40, 40, 15.5, 11.5, size, 32)
+        Camera(40, 40, 15.5, 11.5, height=size, width=32)

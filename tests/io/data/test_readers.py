@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -109,7 +111,7 @@ def test_tum_calibrations_are_those_of_the_folder_name(tmp_path):
         )
         given = open_sequence(sequence.root, camera="500,501,320,240")
         assert (
-            given.camera(0) == Camera(500, 501, 320, 240, 480, 640)
+            given.camera(0) == Camera(500, 501, 320, 240, height=480, width=640)
             and given[0].mask is None
         )
 
@@ -237,3 +239,21 @@ def test_fingerprint_tells_changed_input(tmp_path):
     path = sequence.root / "poses.txt"
     path.write_text(path.read_text() + "\n")
     assert fingerprint(sequence.files()) != before
+
+
+def test_depth_of_a_late_clock_in_lists(tmp_path):
+    written = write.WRITERS["tum"](tmp_path)
+    depth = written.path / "depth.txt"
+    rows = [row.split() for row in depth.read_text().splitlines() if row[0] != "#"]
+    late = [f"{float(stamp) + 0.05:.6f} {name}\n" for stamp, name in rows]
+    depth.write_text("".join(late))
+    right = open_sequence(written.path, depth_offset_ms=50)
+    assert len(right) == len(rows)
+    names = [path.name for path in right.depth_files]
+    assert names == [Path(name).name for _, name in rows]
+    with pytest.raises(InputError, match=r"depth-offset-ms.*has no such choice"):
+        open_sequence(write.WRITERS["kitti"](tmp_path).path, depth_offset_ms=50)
+    # matched by their names
+    folder = write.WRITERS["folder"](tmp_path).path
+    with pytest.raises(InputError, match=r"no stamps of its own.*--depth-lag-ms"):
+        open_sequence(folder, depth_offset_ms=50)

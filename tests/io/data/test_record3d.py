@@ -135,7 +135,9 @@ def test_a_camera_and_a_time_for_each_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.timestamps, [5, 5.1, 5.3])
     given = open_sequence(tmp_path / "a.r3d", camera="60,60,8.5,11.5")
     assert given.camera(2).fx == 40
-    rolling = Camera(60, 60, 8.5, 11.5, SIZE[0], SIZE[1], readout_ms=20)
+    rolling = Camera(
+        60, 60, 8.5, 11.5, height=SIZE[0], width=SIZE[1], readout_ms=20
+    )
     given = open_sequence(tmp_path / "a.r3d", camera=rolling)
     assert given.camera(2).readout_ms == 20
 

@@ -56,7 +56,7 @@ def test_the_nearest_counts() -> None:
 
 def test_a_larger_colour_image_has_no_holes() -> None:
     """Three times the pixels of depth: each covers 3 x 3 of colour, edges to the pixel."""
-    large = Camera(30.0, 30.0, 3 * 4.0 - 0.5, 3 * 3.0 - 0.5, 18, 24)
+    large = Camera(30.0, 30.0, 3 * 4.0 - 0.5, 3 * 3.0 - 0.5, height=18, width=24)
     depth = np.full((6, 8), 3.0, np.float32)
     depth[2, 3] = 1.0
     found = register_depth(depth, SMALL, np.eye(4), large)
@@ -66,8 +66,8 @@ def test_a_larger_colour_image_has_no_holes() -> None:
 
 
 def test_rotated_points_against_projection_by_opencv() -> None:
-    camera = Camera(200.0, 210.0, 80.0, 60.0, 120, 160)
-    colour = Camera(180.0, 180.0, 70.0, 50.0, 110, 150)
+    camera = Camera(200.0, 210.0, 80.0, 60.0, height=120, width=160)
+    colour = Camera(180.0, 180.0, 70.0, 50.0, height=110, width=150)
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("xyz", (2, -3, 1), degrees=True).as_matrix()
     T[:3, 3] = 0.03, -0.01, 0.02
@@ -96,7 +96,9 @@ def test_a_real_sensor_whose_depth_is_not_registered(shared_data: Path) -> None:
 
     def camera(name: str) -> Camera:
         fx, fy, cx, cy = (content[name][key] for key in ("fx", "fy", "cx", "cy"))
-        return Camera(fx, fy, cx - 1, cy - 1, 480, 640)  # Matlab counts from 1
+        return Camera(
+            fx, fy, cx - 1, cy - 1, height=480, width=640
+        )  # Matlab counts from 1
 
     T = np.eye(4)
     T[:3, :3] = content["R_rgb_depth"]

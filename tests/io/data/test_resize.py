@@ -9,7 +9,7 @@ from hybridvo.core.errors import InputError
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.resize import resize_camera, resize_frame
 
-CAMERA = Camera(320.0, 320.0, 319.5, 239.5, 480, 640)
+CAMERA = Camera(320.0, 320.0, 319.5, 239.5, height=480, width=640)
 
 
 def test_camera_by_hand():
@@ -27,7 +27,7 @@ def test_camera_by_hand():
 def test_depth_is_never_mixed(rng):
     depth = np.where(rng.random((48, 64)) < 0.5, 1.0, 9.0).astype(np.float32)
     depth[0] = np.nan
-    camera = Camera(32, 32, 31.5, 23.5, 48, 64)
+    camera = Camera(32, 32, 31.5, 23.5, height=48, width=64)
     frame = Frame(
         np.zeros((48, 64, 3), np.uint8),
         depth,

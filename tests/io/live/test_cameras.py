@@ -83,7 +83,7 @@ def test_a_broken_sdk_says_why(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_depth_out_of_range_is_taken_away() -> None:
-    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, height=2, width=3)
     settings = CameraSettings(min_depth_m=0.5, max_depth_m=4.0)
     depth = np.array([[0.4, 0.5, 4.0], [4.1, np.nan, 0.0]])
     made = FrameMaker(Lens(camera), settings).frame(
@@ -95,7 +95,7 @@ def test_depth_out_of_range_is_taken_away() -> None:
 
 
 def test_the_shutter_is_that_of_the_settings(image_walk: Path) -> None:
-    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, height=2, width=3)
     maker = FrameMaker(Lens(camera), CameraSettings(readout_ms=18.0))
     made = maker.frame(np.zeros((2, 3), np.uint8), None, 0.0)
     assert made.camera.readout_ms == 18
@@ -108,7 +108,7 @@ def test_the_shutter_is_that_of_the_settings(image_walk: Path) -> None:
 
 
 def test_an_infrared_image_is_of_the_time_of_its_depth() -> None:
-    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, 2, 3)
+    camera = hvo.Camera(50.0, 50.0, 1.0, 0.5, height=2, width=3)
     for image, expected in (("color", (32, 7)), ("infrared", (0, 0))):
         settings = replace(read_preset("d435"), image=image, depth_lag_ms=7)
         maker = FrameMaker(Lens(camera), settings)
@@ -118,7 +118,7 @@ def test_an_infrared_image_is_of_the_time_of_its_depth() -> None:
 
 def test_the_lens_bends_nothing_afterwards() -> None:
     """A point lands where a pinhole puts it, wherever the lens put it before."""
-    camera = hvo.Camera(60.0, 60.0, 31.5, 23.5, 48, 64)
+    camera = hvo.Camera(60.0, 60.0, 31.5, 23.5, height=48, width=64)
     distortion = (-0.5, 0.2, 0.01, -0.02, 0.0)
     point = np.array([[0.45, 0.3, 1.0]])
     zero = np.zeros(3)
@@ -206,3 +206,17 @@ def test_files_that_are_gone_are_named_as_such(
     reading = camera.read(9.0)
     assert reading.is_gone and reading.frame is None
     assert reading.note == f"files are gone since frame {reading.number}"
+
+
+def test_an_image_that_is_gone_is_named_although_depth_is_there(
+    image_walk: Path, tmp_path: Path
+) -> None:
+    recording = tmp_path / "walk"
+    shutil.copytree(image_walk, recording)
+    camera, _ = play(recording)
+    assert camera.read(9.0).frame is not None
+    for path in hvo.open_sequence(recording).rgb_files[1:]:
+        path.unlink()
+    reading = camera.read(9.0)
+    assert reading.is_gone and reading.frame is None
+    assert reading.note.startswith(f"the image of frame {reading.number} is gone")

@@ -28,7 +28,7 @@ from hybridvo.io.cameras.settings import CameraSettings, read_preset
 
 WIDTH, HEIGHT = 16, 12
 FOCAL = 20.0
-CAMERA = hvo.Camera(FOCAL, FOCAL + 1, 7.5, 5.5, HEIGHT, WIDTH)
+CAMERA = hvo.Camera(FOCAL, FOCAL + 1, 7.5, 5.5, height=HEIGHT, width=WIDTH)
 BGR = np.full((HEIGHT, WIDTH, 3), (30, 20, 10), np.uint8)
 MILLIMETRES = np.full((HEIGHT, WIDTH), 1500, np.uint16)
 MOUNT = [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]
@@ -554,7 +554,9 @@ def test_openni_hands_out_what_comes(capture: MagicMock) -> None:
     before = time.time()
     made = camera.read(0.1).frame
     # the focal length is OpenNI's, the centre that of the image
-    assert made.camera == hvo.Camera(FOCAL, FOCAL, 7.5, 5.5, HEIGHT, WIDTH)
+    assert made.camera == hvo.Camera(
+        FOCAL, FOCAL, 7.5, 5.5, height=HEIGHT, width=WIDTH
+    )
     assert made.rgb[0, 0].tolist() == [10, 20, 30]
     np.testing.assert_allclose(made.depth, 1.5)
     assert before <= made.timestamp <= time.time()
@@ -578,7 +580,9 @@ def test_openni_takes_intrinsics_that_belong_to_its_images(
 ) -> None:
     given = (30.0, 31.0, 7.0, 6.0)
     camera = opened(settings("opencv", intrinsics=given))
-    assert camera.read(0.1).frame.camera == hvo.Camera(*given, HEIGHT, WIDTH)
+    assert camera.read(0.1).frame.camera == hvo.Camera(
+        *given, height=HEIGHT, width=WIDTH
+    )
     with pytest.raises(hvo.InputError, match="512x424"):
         opened(read_preset("kinect_v2")).read(0.1)
 

@@ -169,7 +169,9 @@ def test_a_frame_comes_out_as_it_went_in(
     reading = camera.read(LONG_S)
     assert reading is not None and reading.frame is not None
     made = reading.frame
-    assert made.camera == hvo.Camera(60.0, 61.0, 31.0, 23.0, HEIGHT, WIDTH)
+    assert made.camera == hvo.Camera(
+        60.0, 61.0, 31.0, 23.0, height=HEIGHT, width=WIDTH
+    )
     assert made.rgb[0, 0].tolist() == [77, 10, 20]
     # registered to colour, whose camera is the same here; its border may be lost
     assert made.depth[HEIGHT // 2, WIDTH // 2] == pytest.approx(1.5, abs=UNITS)

@@ -12,7 +12,7 @@ import pytest
 from hybridvo import InputError, open_sequence
 from hybridvo.io.cameras.choose import choose_camera
 from hybridvo.run.cli import main
-from hybridvo.run.commands.run import restored, saved
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo.tracking.depth_scale import ScaleFilter, divided
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.tracker_state import Sensors, TrackerState

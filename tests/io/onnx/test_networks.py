@@ -29,7 +29,7 @@ from tests.io.onnx.graphs import (
 
 HEIGHT = 12
 WIDTH = 16
-CAMERA = Camera(20.0, 20.0, 7.5, 5.5, HEIGHT, WIDTH)
+CAMERA = Camera(20.0, 20.0, 7.5, 5.5, height=HEIGHT, width=WIDTH)
 DEPTH = "task: depth\n"
 FLOW = "task: flow\n"
 

@@ -34,7 +34,7 @@ from hybridvo_lab.synthetic.noise_scenarios import Scenario, make_pair
 
 POINT_SOLVERS = ["pnp-ransac", "pnp-ransac-tuned", "usac-magsac", "poselib"]
 HEIGHT, WIDTH = 96, 160
-CAMERA = Camera(150.0, 155.0, 80.5, 46.0, HEIGHT, WIDTH)
+CAMERA = Camera(150.0, 155.0, 80.5, 46.0, height=HEIGHT, width=WIDTH)
 
 
 @pytest.fixture(params=POINT_SOLVERS)
@@ -112,8 +112,8 @@ def test_two_cameras_prev_gives_points_curr_gives_pixels(solver):
 
     One K for both would need a motion towards the scene to explain it.
     """
-    prev = Camera(150.0, 150.0, 79.5, 47.5, HEIGHT, WIDTH)
-    curr = Camera(180.0, 180.0, 81.5, 46.5, HEIGHT, WIDTH)
+    prev = Camera(150.0, 150.0, 79.5, 47.5, height=HEIGHT, width=WIDTH)
+    curr = Camera(180.0, 180.0, 81.5, 46.5, height=HEIGHT, width=WIDTH)
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
     flow = np.stack([1.2 * (u - 79.5) + 81.5 - u, 1.2 * (v - 47.5) + 46.5 - v], -1)
     zoom = _pair(flow=flow, prev=prev, curr=curr)
@@ -294,7 +294,7 @@ def _textured_pair(
 ) -> FramePair:
     """A textured frontal plane at 2 m in both cameras, rendered by inverse warping."""
     height, width = 240, 320
-    prev = Camera(260.0, 260.0, 159.5, 119.5, height, width)
+    prev = Camera(260.0, 260.0, 159.5, 119.5, height=height, width=width)
     curr = prev if curr is None else curr
     rng = np.random.default_rng(1)
     texture = cv2.GaussianBlur(
@@ -327,7 +327,7 @@ def _textured_pair(
 @pytest.mark.parametrize("zoom", [1.0, 1.05])
 def test_rgbd_odometry_on_a_textured_plane(name, flow, zoom):
     method = _available(name)
-    curr = Camera(260.0 * zoom, 260.0 * zoom, 159.5, 119.5, 240, 320)
+    curr = Camera(260.0 * zoom, 260.0 * zoom, 159.5, 119.5, height=240, width=320)
     T = _motion((0.01, -0.008, 0.005), (0.002, 0.001, 0.004))
     result = method(_textured_pair(T, curr, flow))
     _assert_sane(result)

@@ -11,7 +11,7 @@ from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo_lab import baselines
 from hybridvo_lab.baselines.clouds import points_of
 
-CAMERA = Camera(260.0, 260.0, 159.5, 119.5, 240, 320)
+CAMERA = Camera(260.0, 260.0, 159.5, 119.5, height=240, width=320)
 HALF_SIZES = np.array([1.6, 1.1, 2.4])
 """Half of the lengths of a box, metres, with the camera inside."""
 T_TRUE = se3_exp(np.array([0.012, -0.008, 0.015, 0.004, -0.006, 0.003]))

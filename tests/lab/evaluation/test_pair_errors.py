@@ -10,7 +10,7 @@ from hybridvo.core.geometry import ego_flow, invert, make_transform
 from hybridvo.core.types import Camera
 from hybridvo_lab.evaluation.scores import pair_errors, pair_factors
 
-CAMERA = Camera(200.0, 200.0, 127.5, 63.5, 128, 256)
+CAMERA = Camera(200.0, 200.0, 127.5, 63.5, height=128, width=256)
 """Camera of the paper's size, principal point in the middle: nothing is resized."""
 
 
@@ -38,7 +38,7 @@ def test_pair_errors_by_hand():
 
 def test_paper_epe_at_another_native_size():
     # 512x512 at f = 400: at 128x256 one has fx' = 200, fy' = 100; the same motion gives 1 and -1 px
-    camera = Camera(400.0, 400.0, 255.5, 255.5, 512, 512)
+    camera = Camera(400.0, 400.0, 255.5, 255.5, height=512, width=512)
     depth = np.full(camera.shape, 4.0)
     T_est = make_transform(np.eye(3), np.array([0.02, -0.04, 0.0]))
     errors = pair_errors(T_est, np.eye(4), depth, camera, camera)
@@ -49,7 +49,7 @@ def test_paper_epe_at_another_native_size():
 def test_paper_epe_scales_the_principal_point_about_pixel_corners():
     # forward motion with a known focus of expansion: u' = (u - cx') z / z' + cx' at the small size,
     # cx' = (511 + 0.5) / 4 - 0.5 = 127.375, cy' = (200 + 0.5) / 2 - 0.5 = 99.75
-    camera = Camera(400.0, 400.0, 511.0, 200.0, 256, 1024)
+    camera = Camera(400.0, 400.0, 511.0, 200.0, height=256, width=1024)
     T_est = make_transform(np.eye(3), np.array([0.0, 0.0, -1.0]))
     errors = pair_errors(
         T_est, np.eye(4), np.full(camera.shape, 5.0), camera, camera
@@ -61,7 +61,7 @@ def test_paper_epe_scales_the_principal_point_about_pixel_corners():
 
 def test_paper_epe_takes_the_nearest_depth_at_pixel_centres():
     # 384 rows, 3 to 1: centre of small row i is native row 3 i + 1; only those rows hold 4 m
-    camera = Camera(200.0, 200.0, 127.5, 191.5, 384, 256)
+    camera = Camera(200.0, 200.0, 127.5, 191.5, height=384, width=256)
     depth = np.full(camera.shape, 1e-3)
     depth[1::3] = 4.0
     T_est = make_transform(np.eye(3), np.array([0.02, 0.0, 0.0]))

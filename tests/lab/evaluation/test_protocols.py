@@ -27,7 +27,9 @@ STEP = np.array([0.03, -0.01, 0.02])
 def camera(name: str, number: int) -> Camera:
     first, last = ZOOMS.get(name, (0, 0))
     f = 70.0 * (1 + 0.002 * (min(max(number, first), last) - first))
-    return Camera(f, f, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, HEIGHT, WIDTH)
+    return Camera(
+        f, f, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, height=HEIGHT, width=WIDTH
+    )
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +114,14 @@ def test_the_paper_leaves_out_pairs_whose_intrinsics_change(
 
 
 def test_cameras_are_the_same_to_rounding() -> None:
-    K = Camera(1120.0, 1120.0, 511.5, 217.5, 436, 1024)
+    K = Camera(1120.0, 1120.0, 511.5, 217.5, height=436, width=1024)
     assert same_intrinsics(
-        K, Camera(1120.0 * (1 + 1e-12), 1120.0, 511.5, 217.5, 436, 1024)
+        K,
+        Camera(1120.0 * (1 + 1e-12), 1120.0, 511.5, 217.5, height=436, width=1024),
     )
-    assert not same_intrinsics(K, Camera(1120.01, 1120.0, 511.5, 217.5, 436, 1024))
-    assert not same_intrinsics(K, Camera(1120.0, 1120.0, 511.5, 217.5, 435, 1024))
+    assert not same_intrinsics(
+        K, Camera(1120.01, 1120.0, 511.5, 217.5, height=436, width=1024)
+    )
+    assert not same_intrinsics(
+        K, Camera(1120.0, 1120.0, 511.5, 217.5, height=435, width=1024)
+    )

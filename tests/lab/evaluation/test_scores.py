@@ -66,7 +66,7 @@ def test_the_interval_of_a_rate_by_hand() -> None:
 
 def test_the_limit_follows_the_noise_of_the_truth() -> None:
     """As a rotation and a translation of that size move the pixel in the middle of the image."""
-    camera = Camera(500.0, 500.0, 319.5, 239.5, 480, 640)
+    camera = Camera(500.0, 500.0, 319.5, 239.5, height=480, width=640)
     depth = np.full((480, 640), 2.0)
     degrees, metres = TRUTH_NOISE["tum"]
     for x, angle in ((metres, 0.0), (0.0, np.radians(degrees))):
@@ -81,7 +81,7 @@ def test_the_limit_follows_the_noise_of_the_truth() -> None:
     assert wrong_limit("tum", camera, depth) == pytest.approx(both)
     # rendered: the truth is exact
     assert wrong_limit("sintel", camera, depth) == 1.0
-    small = Camera(50.0, 50.0, 31.5, 23.5, 48, 64)
+    small = Camera(50.0, 50.0, 31.5, 23.5, height=48, width=64)
     assert wrong_limit("tum", small, np.full((48, 64), np.nan)) == 1.0
     limits = {"wrong_limit_px": 4.0}
     pairs = table(row(0, 3.0, **limits), row(1, 5.0, **limits), row(2, 3.0))

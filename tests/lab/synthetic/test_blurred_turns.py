@@ -12,7 +12,7 @@ from hybridvo.flow.providers import dis_flow
 from hybridvo_lab.synthetic.blurred_turns import Recorded, draw_blurred_turn
 
 SIZE = (240, 320)
-CAMERA = Camera(300.0, 300.0, 159.5, 119.5, *SIZE)
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, height=SIZE[0], width=SIZE[1])
 NOTHING = np.zeros(SIZE, np.uint8)
 
 

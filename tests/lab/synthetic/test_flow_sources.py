@@ -15,7 +15,7 @@ from hybridvo_lab.synthetic.flow_sources import (
     draw_estimated_flow,
 )
 
-CAMERA = Camera(200.0, 200.0, 95.5, 63.5, 128, 192)
+CAMERA = Camera(200.0, 200.0, 95.5, 63.5, height=128, width=192)
 SHIFT = np.array([2.0, -1.0])
 
 

@@ -22,7 +22,7 @@ from hybridvo_lab.synthetic.render import (
 )
 from hybridvo_lab.synthetic.scenes import FAMILIES, HEAVY, make_scene
 
-CAMERA = Camera(20.0, 20.0, 10.0, 5.0, 11, 21)
+CAMERA = Camera(20.0, 20.0, 10.0, 5.0, height=11, width=21)
 
 
 def affine(half, centre):

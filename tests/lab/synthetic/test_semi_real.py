@@ -24,7 +24,7 @@ from hybridvo_lab.synthetic.semi_real import (
 def recording(seed: int, count: int = 2) -> Recording:
     """Frames of a textured, curved wall with a hole in its depth; every one of another wall."""
     rng = np.random.default_rng(seed)
-    camera = Camera(240.0, 240.0, 149.5, 112.5, 226, 300)
+    camera = Camera(240.0, 240.0, 149.5, 112.5, height=226, width=300)
     u, v = np.meshgrid(np.arange(300), np.arange(226))
     frames = []
     for k in range(count):
@@ -61,7 +61,7 @@ def test_flow_obeys_the_motion_where_the_scene_is_static(
 
 
 def test_through_a_rolling_shutter_the_camera_turns_on_from_row_to_row() -> None:
-    camera = Camera(200.0, 200.0, 80.0, 60.0, 121, 161)
+    camera = Camera(200.0, 200.0, 80.0, 60.0, height=121, width=161)
     u = np.indices((121, 161), np.float32)[1]
     canvas = Canvas(np.dstack([u] * 3), u + 1, 0 * u, np.zeros_like(u))
     # 0.02 rad: 4 px from the first row to the last
@@ -73,7 +73,7 @@ def test_through_a_rolling_shutter_the_camera_turns_on_from_row_to_row() -> None
 
 
 def test_a_long_exposure_blurs_along_the_turn_and_leaves_depth_alone() -> None:
-    camera = Camera(200.0, 200.0, 80.0, 60.0, 121, 161)
+    camera = Camera(200.0, 200.0, 80.0, 60.0, height=121, width=161)
     u = np.indices((121, 161), np.float32)[1]
     step = (u > 80).astype(np.float32)
     canvas = Canvas(np.dstack([step] * 3), step + 1, 0 * u, np.zeros_like(u))

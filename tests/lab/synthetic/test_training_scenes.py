@@ -24,7 +24,7 @@ def test_stairs_move_as_one() -> None:
     step = make_transform(np.eye(3), np.array([0.1, 0.0, 0.0]))
     draw = moving_object(rng, stairs(rng), np.stack([place, step @ place]))
     solids = tuple(draw(1, 1.0))
-    camera = Camera(120.0, 120.0, 79.5, 59.5, 120, 160)
+    camera = Camera(120.0, 120.0, 79.5, 59.5, height=120, width=160)
     scene = Scene(camera, np.stack([np.eye(4)] * 2), solids)
     pair = render_pair(scene)
     seen = np.isfinite(pair.flow).all(axis=2) & pair.moving

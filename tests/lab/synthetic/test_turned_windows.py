@@ -128,7 +128,7 @@ def test_a_camera_that_turns_sees_the_recording_by_a_homography(recordings) -> N
     """OpenCV's warp of the image, by K R^T K^-1, is the same picture."""
     recording = recordings[0]
     whole = recording.frames[0].camera
-    window = Camera(400.0, 400.0, 119.5, 79.5, 160, 240)
+    window = Camera(400.0, 400.0, 119.5, 79.5, height=160, width=240)
     yaw = np.radians([0.0, 3.0, -5.0])
     R = np.stack([cv2.Rodrigues(np.array([0.0, each, 0.0]))[0] for each in yaw])
     frames = turning_camera(recording, R, window)

@@ -13,7 +13,7 @@ from hybridvo.core.geometry import ego_flow, invert, se3_exp, se3_log
 from hybridvo.core.types import Camera
 from hybridvo_lab.windows.window import refine_window
 
-CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 48, 64)
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, height=48, width=64)
 EDGES = [[0, 1], [1, 2], [0, 2]]
 
 

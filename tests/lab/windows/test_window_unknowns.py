@@ -69,7 +69,12 @@ def drawn(
     true = scene.camera
     factor = np.exp(-log_focal)
     stated = Camera(
-        true.fx * factor, true.fy * factor, true.cx, true.cy, height, width
+        true.fx * factor,
+        true.fy * factor,
+        true.cx,
+        true.cy,
+        height=height,
+        width=width,
     )
     depths = [scene.depth(k) for k in range(3)]
     noise = depth_noise * rng.normal(size=(3, *size)) - log_scale[:, None, None]

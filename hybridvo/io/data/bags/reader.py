@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number
 from hybridvo.core.errors import FormatError, InputError
@@ -21,12 +23,12 @@ from hybridvo.io.data.bags.tape import Tape
 from hybridvo.io.data.bags.topics import (
     Topics,
     TopicSummary,
-    choose_gyroscope,
     choose_topics,
     is_rectified,
     is_registered,
 )
 from hybridvo.io.data.camera_file import parse_camera
+from hybridvo.io.data.lists import abbreviated
 from hybridvo.io.data.registration import register_depth
 from hybridvo.io.data.sequence import UndistortionMaps
 from hybridvo.io.data.streams import (
@@ -43,6 +45,8 @@ MAX_TRANSFORMS = 500
 """Messages of ``/tf`` or ``/tf_static`` that are looked at: fixed frames are known by then."""
 SAME_PLACE_M = 1e-4
 """Distance of two cameras, m, below which they are one."""
+UNIT_TOLERANCE = 1e-2
+"""By which the length of a stated quaternion may differ from 1: of digits left out."""
 SAME_ANGLE = 1e-4
 """Entries by which two rotations may differ and be one."""
 
@@ -65,11 +69,14 @@ class _Index:
     # messages with transforms that were looked at
     looked_at: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def fixed(self) -> dict[tuple[str, str], np.ndarray]:
+        """The transforms that do not change."""
+        return {e: T for e, T in self.edges.items() if e not in self.moving}
 
-REALSENSE_IMAGES = "/image/data"
-"""How the topics of images end in a recording of RealSense's tools."""
-REALSENSE_RATES = "/imu/data"
-"""How those of its inertial sensor end."""
+
+REALSENSE_STREAM = re.compile(r"(/device_\d+/sensor_\d+/.+)/(image|imu)/data")
+"""Topics of images and of the inertial sensor in a recording of RealSense's tools."""
 
 
 class BagSequence(StreamSequence):
@@ -81,7 +88,10 @@ class BagSequence(StreamSequence):
 
     kind = "bag"
     depth_scale = MILLIMETRES
-    choices = ("topic_rgb", "topic_depth", "topic_info", "topic_truth")
+    choices = (
+        *("topic_rgb", "topic_depth", "topic_info", "topic_truth"),
+        *("topic_imu", "imu_rotation", "depth_offset_ms", "frame"),
+    )
     markers = (("metadata.yaml", "*.mcap"), ("metadata.yaml", "*.db3"))
 
     @classmethod
@@ -100,7 +110,6 @@ class BagSequence(StreamSequence):
     def _open(self) -> None:
         self._bag = Bag(self.root)
         self.topics = self._choose_topics()
-        self._gyroscope = choose_gyroscope(self._bag.counts, self._bag.types)
         index = self._read_index()
         if self._bag.notes:
             self.warnings += [*self._bag.notes, self._what_is_used(index)]
@@ -111,15 +120,18 @@ class BagSequence(StreamSequence):
         self._take_lens(index, rgb.shape[:2])
         usual = self._unit_of_realsense() or MILLIMETRES
         self._units = units_per_metre(self._given_scale, usual, self.warnings)
+        self._used_scale = self._units
         self._take_registration(index)
         self._take_truth(index)
         self._take_gyroscope(index)
+        self._take_frame(index)
 
     def opened_with(self) -> dict[str, Any]:
         """Return what decides how the bag is read, JSON-ready."""
         topics = self.topics._asdict()
         topics.pop("guessed")
-        return super().opened_with() | {"topics": topics}
+        scale = {"depth_scale": self._used_scale}
+        return super().opened_with() | scale | {"topics": topics}
 
     def _what_is_used(self, index: _Index) -> str:
         """State how much of a damaged bag can be read, and how much there was, where known."""
@@ -155,6 +167,7 @@ class BagSequence(StreamSequence):
                 depth=chosen.get("topic_depth"),
                 info=chosen.get("topic_info"),
                 truth=chosen.get("topic_truth"),
+                imu=chosen.get("topic_imu"),
                 needs_depth=self._needs_depth,
             )
         except InputError as error:
@@ -173,7 +186,7 @@ class BagSequence(StreamSequence):
             index.times[topic] = array("q")
         transforms = {t for t, kind in bag.types.items() if kind in ros.TF_TYPES}
         bare = {t for t, kind in bag.types.items() if kind == ros.TRANSFORM_TYPE}
-        wanted = {*topics[:5], *transforms, *bare, self._gyroscope} - {""}
+        wanted = {*topics[:5], topics.imu, *transforms, *bare} - {""}
         wanted = {topic for topic in wanted if bag.counts.get(topic)}
         damaged = 0
         for message in bag.all_messages(wanted):
@@ -197,7 +210,7 @@ class BagSequence(StreamSequence):
         elif message.topic in (topics.rgb_info, topics.depth_info):
             if message.topic not in index.infos:
                 index.infos[message.topic] = bag.decode(message)
-        elif message.topic == self._gyroscope:
+        elif message.topic == topics.imu:
             index.imu.append(ros.imu_row(bag.decode(message)))
         elif message.topic == topics.truth:
             pose = ros.stamped_pose(bag.decode(message))
@@ -252,6 +265,7 @@ class BagSequence(StreamSequence):
             self.timestamps = rgb_stamps
             return
         depth_stamps, depth_order = self._seconds(index, self.topics.depth)
+        depth_stamps = self._by_colours_clock(depth_stamps)
         pairs = lists.depth_at(rgb_stamps, depth_stamps, self.root, self.warnings)
         self._rgb_at = [int(rgb_order[i]) for i, _ in pairs]
         self._depth_at = [int(depth_order[j]) for _, j in pairs]
@@ -333,8 +347,7 @@ class BagSequence(StreamSequence):
         same_frame = bool(depth_frame) and depth_frame == self._rgb_frame
         if same_size and (is_registered(topics.depth) or same_frame):
             return
-        fixed = {e: T for e, T in index.edges.items() if e not in index.moving}
-        T = ros.transform_between(fixed, self._rgb_frame, depth_frame)
+        T = ros.transform_between(index.fixed, self._rgb_frame, depth_frame)
         info = index.infos.get(topics.depth_info)
         own_info = topics.depth_info not in ("", topics.rgb_info)
         if T is None or info is None or not own_info:
@@ -383,9 +396,8 @@ class BagSequence(StreamSequence):
         """Take the true poses of the camera of colour, which may be those of a body."""
         if not index.poses:
             return
-        fixed = {e: T for e, T in index.edges.items() if e not in index.moving}
         child = index.poses[0].child
-        T_child_rgb = ros.transform_between(fixed, child, self._rgb_frame)
+        T_child_rgb = ros.transform_between(index.fixed, child, self._rgb_frame)
         if T_child_rgb is None:
             T_child_rgb = np.eye(4)
             whose = f"frame '{child}'" if child else "a frame that is not named"
@@ -404,18 +416,44 @@ class BagSequence(StreamSequence):
         """Take the samples of the gyroscope, where it is known how it is fixed to the camera."""
         if not index.imu:
             return
-        frame = self._frame_id(self._gyroscope)
-        fixed = {e: T for e, T in index.edges.items() if e not in index.moving}
-        T_rgb_imu = ros.transform_between(fixed, self._rgb_frame, frame)
-        if T_rgb_imu is None:
-            self._warn(
-                f"{self._gyroscope} is not used: no /tf_static between '{frame}' and "
-                f"'{self._rgb_frame}'"
-            )
+        R_rgb_imu = self._R_rgb_imu(index)
+        if R_rgb_imu is None:
             return
         samples = np.array(index.imu)
         samples[:, 0] /= 1e9
-        self._take_imu(samples, T_rgb_imu[:3, :3])
+        self._take_imu(samples, R_rgb_imu)
+
+    def _R_rgb_imu(self, index: _Index) -> np.ndarray | None:
+        """Rotation (3, 3) from the axes of the IMU to those of colour; None: it is not known."""
+        if stated := self.chosen.get("imu_rotation"):
+            return rotation_of(stated)
+        frame = self._frame_id(self.topics.imu)
+        T_rgb_imu = ros.transform_between(index.fixed, self._rgb_frame, frame)
+        if T_rgb_imu is None:
+            self._warn(
+                f"{self.topics.imu} is not used: no /tf_static between its frame '{frame}' and "
+                f"'{self._rgb_frame}' of the images; state its rotation with --imu-rotation "
+                "x,y,z,w"
+            )
+            return None
+        R: np.ndarray = T_rgb_imu[:3, :3]
+        return R
+
+    def _take_frame(self, index: _Index) -> None:
+        """Take the place of the frame of reference whose path the user asks for."""
+        name = self.chosen.get("frame")
+        if name is None:
+            return
+        frame = name.lstrip("/")
+        self.T_cam_frame = ros.transform_between(
+            index.fixed, self._rgb_frame, frame
+        )
+        if self.T_cam_frame is None:
+            there = sorted({each for edge in index.fixed for each in edge})
+            raise InputError(
+                f"--frame {name[:100]}: {self.root}: no /tf_static between it and "
+                f"'{self._rgb_frame}' of the images; fixed frames: {abbreviated(there) or 'none'}."
+            )
 
     def _unit_of_realsense(self) -> float | None:
         """Units per metre in a recording of RealSense's tools, which states metres per unit."""
@@ -459,6 +497,7 @@ class BagSequence(StreamSequence):
         stored = ros.depth_image(message)
         if stored.dtype == np.float32:
             scale = self._given_scale or 1.0
+            self._used_scale = scale
             return stored if scale == 1.0 else stored / np.float32(scale)
         depth = stored.astype(np.float32) / np.float32(self._units)
         depth[stored == np.iinfo(stored.dtype).max] = 0.0
@@ -470,12 +509,34 @@ class BagSequence(StreamSequence):
 
     def _frame_id(self, topic: str) -> str:
         """The frame of reference that the images of a topic name; empty where they name none."""
-        for ending in (REALSENSE_IMAGES, REALSENSE_RATES):
-            if topic.endswith(ending):
-                # RealSense's recorder writes the same frame into all headers
-                return topic.removesuffix(ending)
+        if stream := REALSENSE_STREAM.fullmatch(topic):
+            # RealSense's recorder writes the same frame into all headers
+            return stream[1]
         first = self._bag.first(topic)
         return "" if first is None else str(first.header.frame_id).lstrip("/")
+
+
+def rotation_of(text: str) -> np.ndarray:
+    """Return the rotation (3, 3) that a user states as a quaternion.
+
+    Args:
+        text: ``x,y,z,w`` as ROS has them.
+
+    Raises:
+        InputError: It is no unit quaternion.
+
+    Example:
+        >>> rotation_of("0,0,0.7071,0.7071").round(3).tolist()
+        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    values = np.array([as_number(part) for part in text.split(",")])
+    if values.shape == (4,) and abs(np.linalg.norm(values) - 1) < UNIT_TOLERANCE:
+        return np.asarray(Rotation.from_quat(values).as_matrix())
+    raise InputError(
+        "--imu-rotation: expected the unit quaternion x,y,z,w that turns the axes of the IMU into "
+        f"those of the camera (x right, y down, z forward), got '{text[:80]}'. Axes that are those "
+        "of the camera: 0,0,0,1."
+    )
 
 
 def summaries_of(bag: Bag) -> list[TopicSummary]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import heapq
-import shutil
 import sys
 import weakref
 from collections import Counter
@@ -30,6 +29,8 @@ FIRST_GAP_NS = 10**8
 """How far reading jumps at first, ns, where a part of a bag is damaged; then twice as far."""
 LATEST_NS = 2**63 - 1
 ZSTD_HEADER_BYTES = 18
+UNPACKED_AT_ONCE = 2**20
+"""Bytes."""
 
 
 class Message(NamedTuple):
@@ -67,10 +68,9 @@ class Bag:
             self._types.register(_transform_types())
         self._are_messages_packed = False
         self._readers: list[Any] = []
-        # files that were packed as a whole
-        self._unpacked: list[Any] = []
+        self._scratch = _Scratch()
         self._close = weakref.finalize(
-            self, _close_all, self._readers, self._unpacked
+            self, _close_all, self._readers, self._scratch
         )
         try:
             self._open_readers()
@@ -232,26 +232,8 @@ class Bag:
             files = found.files
             self.notes += found.notes
             self._are_messages_packed = found.are_messages_packed
-        for file in files:
-            self._readers.append(self._opened(self._plain(file)))
-
-    def _plain(self, file: Path) -> Path:
-        """The file, or what it unpacks to where it was packed as a whole."""
-        file_size(file)
-        if file.suffix.lower() != PACKED:
-            return file
-        folder = TemporaryDirectory(prefix="hybridvo-bag-")
-        self._unpacked.append(folder)
-        target = Path(folder.name) / file.stem
-        try:
-            _unpack_file(file, target)
-        except InputError:
-            raise
-        # the decoder has errors of its own
-        except Exception as error:
-            reason = " ".join(str(error).split())[:200]
-            raise FormatError(f"{file}: cannot be unpacked ({reason}).") from None
-        return target
+        for file in self._scratch.unpacked(files):
+            self._readers.append(self._opened(file))
 
     def _opened(self, path: Path) -> Any:
         """Open a file, or what is whole of it where its index is not."""
@@ -286,30 +268,88 @@ class Bag:
         return reader
 
 
+class _Scratch:
+    """The files of a bag that were packed as a whole, unpacked into a temporary folder."""
+
+    def __init__(self) -> None:
+        self._folder: TemporaryDirectory[str] | None = None
+
+    def unpacked(self, files: list[Path]) -> list[Path]:
+        """Return the files of a bag; in place of a packed one what it unpacks to.
+
+        Raises:
+            FormatError: One cannot be unpacked, or all together unpack to more than a recording
+                does.
+        """
+        packed = [file for file in files if file.suffix.lower() == PACKED]
+        limit = unpacked_limit(sum(file_size(file) for file in packed))
+        room = limit
+        plain = []
+        for number, file in enumerate(files):
+            file_size(file)
+            if file in packed:
+                source = file
+                # two files of a bag may have one name but for its ending
+                file = self._path() / f"{number}-{file.stem}"
+                room -= _unpack_file(source, file, room, limit)
+            plain.append(file)
+        return plain
+
+    def remove(self) -> None:
+        """Remove the folder, if there is one."""
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def _path(self) -> Path:
+        if self._folder is None:
+            self._folder = TemporaryDirectory(prefix="hybridvo-bag-")
+        return Path(self._folder.name)
+
+
+def _unpack_file(packed: Path, target: Path, room: int, limit: int) -> int:
+    """Unpack a file that zstd packed as a whole, into another file; return its bytes.
+
+    Args:
+        packed: The file.
+        target: The other one.
+        room: To how many bytes it may unpack.
+        limit: To how many bytes all packed files of the bag may unpack, for the message.
+
+    Raises:
+        FormatError: It unpacks to more, or is damaged.
+    """
+    zstd = _zstd()
+    too_large = FormatError(
+        f"{packed}: unpacks to more than a recording does: expected at most {limit} bytes of all "
+        "packed files of the bag. If you know where it comes from, unpack it by 'zstd -d' and "
+        "name what comes out."
+    )
+    written = 0
+    try:
+        stated = zstd.get_frame_info(read_head(packed, ZSTD_HEADER_BYTES))
+        if (stated.decompressed_size or 0) > room:
+            raise too_large
+        with zstd.open(packed) as source, target.open("wb") as file:
+            while part := source.read(UNPACKED_AT_ONCE):
+                written += len(part)
+                if written > room:
+                    raise too_large
+                file.write(part)
+    except InputError:
+        raise
+    # the decoder has errors of its own
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        raise FormatError(f"{packed}: cannot be unpacked ({reason}).") from None
+    return written
+
+
 def _escaped(path: Path) -> Path:
     """A path as rosbags needs it, which makes a part of a URI of it."""
     text = str(path)
     for character in "%?#":
         text = text.replace(character, f"%{ord(character):x}")
     return Path(text)
-
-
-def _unpack_file(packed: Path, target: Path) -> None:
-    """Unpack a file that zstd packed as a whole, into another file.
-
-    Raises:
-        FormatError: It states to unpack to more than a recording does.
-    """
-    zstd = _zstd()
-    stated = zstd.get_frame_info(read_head(packed, ZSTD_HEADER_BYTES))
-    limit = unpacked_limit(file_size(packed))
-    if (stated.decompressed_size or 0) > limit:
-        raise FormatError(
-            f"{packed}: unpacks to more than {limit} bytes, more than a recording does. "
-            "If you know where it comes from, unpack it by 'zstd -d' and name the file."
-        )
-    with zstd.open(packed) as source, target.open("wb") as file:
-        shutil.copyfileobj(source, file)
 
 
 def _zstd() -> Any:
@@ -351,9 +391,8 @@ def storage_ending(path: Path) -> str:
     return Path(path.name.lower().removesuffix(PACKED)).suffix
 
 
-def _close_all(readers: list[Any], unpacked: list[Any]) -> None:
+def _close_all(readers: list[Any], scratch: _Scratch) -> None:
     for reader in readers:
         with contextlib.suppress(Exception):
             reader.close()
-    for folder in unpacked:
-        folder.cleanup()
+    scratch.remove()

@@ -72,6 +72,7 @@ class Topics(NamedTuple):
     depth_info: str
     truth: str
     guessed: str  # a sentence about what was guessed, empty if nothing was
+    imu: str = ""
 
 
 def choose_topics(
@@ -81,6 +82,7 @@ def choose_topics(
     info: str | None = None,
     truth: str | None = None,
     needs_depth: bool = True,
+    imu: str | None = None,
 ) -> Topics:
     """Choose the topics of a bag.
 
@@ -91,6 +93,7 @@ def choose_topics(
         info: That of the camera of colour.
         truth: That of true poses.
         needs_depth: Whether depth is read; a network may predict it.
+        imu: The topic of the inertial sensor.
 
     Returns:
         The topics, the named ones first; that of depth is empty where it is not read.
@@ -132,6 +135,8 @@ def choose_topics(
         info_of(depth_name, infos) if depth_name else "",
         truth_name or (truths[0] if truths else ""),
         "",
+        _named("--topic-imu", imu, topics, (IMU_TYPE,))
+        or choose_gyroscope(topics.values()),
     )
     is_guess = rgb is None or (needs_depth and depth is None)
     if not is_guess:
@@ -140,20 +145,17 @@ def choose_topics(
     return chosen._replace(guessed=_sentence(chosen, others))
 
 
-def choose_gyroscope(counts: dict[str, int], types: dict[str, str]) -> str:
-    """Return the topic of the gyroscope; empty where there is none.
-
-    Args:
-        counts: Of messages, by topic.
-        types: Of messages, likewise.
-    """
+def choose_gyroscope(summaries: Iterable[TopicSummary]) -> str:
+    """Return the topic of the gyroscope, of those that have messages; empty where there is none."""
     found = [
-        name
-        for name, kind in types.items()
-        if kind == IMU_TYPE and counts.get(name) and not _has(name, ("accel",))
+        summary
+        for summary in summaries
+        if summary.type == IMU_TYPE and not _has(summary.name, ("accel",))
     ]
-    named = [name for name in found if _has(name, ("gyro",))] or found
-    return max(named, key=lambda name: counts[name], default="")
+    named = [each for each in found if _has(each.name, ("gyro",))] or found
+    if not named:
+        return ""
+    return max(named, key=lambda summary: summary.messages).name
 
 
 def other_cameras(chosen: str, colours: Iterable[TopicSummary]) -> list[str]:
@@ -290,11 +292,12 @@ def _shared_folders(a: str, b: str) -> int:
 
 
 def _sentence(chosen: Topics, others: list[str]) -> str:
-    truth = f", ground truth {chosen.truth}" if chosen.truth else ""
+    more = f", ground truth {chosen.truth}" if chosen.truth else ""
+    more += f", IMU {chosen.imu}" if chosen.imu else ""
     text = (
         f"topics are guessed: colour {chosen.rgb}, depth {chosen.depth or 'none'}, camera "
-        f"{chosen.rgb_info or 'none'}{truth}; others by --topic-rgb, --topic-depth, "
-        "--topic-info, --topic-truth"
+        f"{chosen.rgb_info or 'none'}{more}; others by --topic-rgb, --topic-depth, "
+        "--topic-info, --topic-truth, --topic-imu"
     )
     if not others:
         return text

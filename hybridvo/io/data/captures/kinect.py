@@ -91,6 +91,7 @@ class KinectSequence(StreamSequence):
     """
 
     kind = "kinect"
+    choices = ("depth_offset_ms",)
     depth_scale = MILLIMETRES
     markers = (("*.mkv",),)
 
@@ -137,6 +138,7 @@ class KinectSequence(StreamSequence):
             raise InputError(
                 f"{self.root}: no frames: the {lacking} track is empty."
             )
+        depth = self._by_colours_clock(depth)
         pairs = lists.depth_at(rgb, depth, self.root, self.warnings)
         self._pairs = [
             (self._recording.colour.times[i], self._recording.depth.times[j])
@@ -452,8 +454,8 @@ def _lens_of(
             p["fy"] * height,
             p["cx"] * width - left - 0.5,
             p["cy"] * height - top - 0.5,
-            size[1],
-            size[0],
+            height=size[1],
+            width=size[0],
         )
     order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     return Lens(pinhole, tuple(p[name] for name in order), "rational_polynomial")

@@ -80,7 +80,9 @@ class ReplicaSequence(Sequence):
         focal_lengths = stated["fx"], stated["fy"]
         centre = stated["cx"], stated["cy"]
         with format_errors(self._file()):
-            return Calibration(Camera(*focal_lengths, *centre, height, width))
+            return Calibration(
+                Camera(*focal_lengths, *centre, height=height, width=width)
+            )
 
 
 def _read_poses(path: Path) -> np.ndarray:

@@ -222,7 +222,7 @@ class TransformsSequence(StreamSequence):
         cx = as_number(stated.get("cx", width / 2)) - 0.5
         cy = as_number(stated.get("cy", height / 2)) - 0.5
         try:
-            camera = Camera(fx, fy, cx, cy, int(height), int(width))
+            camera = Camera(fx, fy, cx, cy, height=int(height), width=int(width))
         except (InputError, OverflowError) as error:
             raise FormatError(f"{self._path}: camera: {error}") from None
         model = str(stated.get("camera_model", "OPENCV"))[:40]

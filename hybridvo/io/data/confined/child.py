@@ -18,6 +18,7 @@ import numpy as np
 from hybridvo.core.errors import FormatError, InputError
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.confined.limits import Limits, allow_one_request, apply_limits
+from hybridvo.io.data.confined.syscalls import refuse_network_and_programs
 from hybridvo.io.data.confined.wire import form_of, receive, send
 from hybridvo.io.data.sequence import Sequence
 
@@ -27,7 +28,10 @@ SOURCES = ("depth_source", "flow_is_true", "depth_scale", "frames_per_second")
 """Attributes of its class, likewise."""
 FILES = ("rgb_files", "depth_files", "flow_files", "mask_files")
 """Lists of paths."""
-ARRAYS = ("timestamps", "depth_timestamps", "poses", "imu_samples", "R_cam_imu")
+ARRAYS = (
+    *("timestamps", "depth_timestamps", "poses"),
+    *("imu_samples", "R_cam_imu", "T_cam_frame"),
+)
 """Arrays of numbers, or None."""
 IMAGES = ("rgb", "depth", "depth_variance", "mask")
 """What a frame is made of."""
@@ -47,6 +51,8 @@ def serve(connection: Connection) -> None:
     request, _ = receive(connection)
     limits = Limits(**request["limits"])
     apply_limits(limits)
+    # where the system cannot, the other limits hold: SECURITY.md
+    refuse_network_and_programs()
     allow_one_request(limits)
     try:
         if request["do"] == "report":

@@ -15,9 +15,11 @@ import importlib
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterable
 from multiprocessing import Pipe, reduction
@@ -34,7 +36,8 @@ END_S = 5
 """Seconds in which the process ends by itself."""
 START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from hybridvo.io.data.confined.fork_server import main; main(int(sys.argv[2]))"
+    "from hybridvo.io.data.confined.fork_server import main; "
+    "main(int(sys.argv[2]), sys.argv[3])"
 )
 """What the process runs: with the path of the one that starts it, but without its folder."""
 CHILD = "hybridvo.io.data.confined.child"
@@ -46,6 +49,8 @@ OTHERS = {".mp4", ".avi", ".mov", ".m4v", ".webm", ".mkv", ".npz", ".sens", ".r3
 """Endings of further recordings that a child reads."""
 MAX_LOOKED_AT = 100
 """Files of a folder by whose names it is decided that a child will be needed."""
+TEMPORARY = ("TMPDIR", "SQLITE_TMPDIR")
+"""Variables that name the folder of temporary files to libraries in C."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """A process of several threads cannot be forked safely."""
 
@@ -55,18 +60,27 @@ class Fork(NamedTuple):
 
     pid: int
     connection: Connection
+    scratch: (
+        Path  # the folder of its temporary files, which whoever requests it removes
+    )
 
 
 class ForkServer:
-    """The other end of the process that forks."""
+    """The other end of the process that forks.
+
+    Attributes:
+        scratch: The folder of all temporary files of its children. Whichever of both processes
+            ends last removes it.
+    """
 
     def __init__(self) -> None:
         """Start it."""
         self.connection, theirs = Pipe()
+        self.scratch = Path(tempfile.mkdtemp(prefix="hybridvo-"))
         package = str(Path(__file__).resolve().parents[4])
         # an empty entry is the folder of the user, in which a stranger's files may be
         path = [entry for entry in sys.path if entry] + [package]
-        words = [json.dumps(path), str(theirs.fileno())]
+        words = [json.dumps(path), str(theirs.fileno()), str(self.scratch)]
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", START, *words],
@@ -83,11 +97,14 @@ class ForkServer:
         """Fork a child, after some modules were imported where they are installed."""
         ours, theirs = Pipe()
         with theirs, self._lock:
-            self._send({"do": "fork", "modules": (CHILD, *modules)})
+            scratch = tempfile.mkdtemp(dir=self.scratch)
+            self._send(
+                {"do": "fork", "modules": (CHILD, *modules), "scratch": scratch}
+            )
             reduction.send_handle(
                 self.connection, theirs.fileno(), self._process.pid
             )
-            return Fork(self._answer(), ours)
+            return Fork(self._answer(), ours, Path(scratch))
 
     def prepare(self, modules: tuple[str, ...]) -> None:
         """Let it import some modules, without waiting for it."""
@@ -108,6 +125,7 @@ class ForkServer:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        shutil.rmtree(self.scratch, ignore_errors=True)
 
     def _send(self, request: dict[str, object]) -> None:
         self.connection.send_bytes(json.dumps(request).encode("ascii"))
@@ -177,11 +195,12 @@ def fork(modules: tuple[str, ...]) -> Fork:
 # -- in the process that forks -----------------------------------------------------------
 
 
-def main(handle: int) -> None:
+def main(handle: int, scratch: str) -> None:
     """Fork children until the process that requests them has gone.
 
     Args:
         handle: Of the connection to it.
+        scratch: The folder of all temporary files of the children, which is removed then.
     """
     # the process that requests children decides when this one ends
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -198,7 +217,7 @@ def main(handle: int) -> None:
                 continue
             if request["do"] == "fork":
                 statuses |= _ended(living)
-                answer = _fork(connection)
+                answer = _fork(connection, request["scratch"])
                 living.add(answer)
                 # a number may be given a second time
                 statuses.pop(answer, None)
@@ -209,6 +228,7 @@ def main(handle: int) -> None:
             connection.send_bytes(str(answer).encode("ascii"))
     for pid in living:
         _end(pid)
+    shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _import(modules: Iterable[str]) -> None:
@@ -218,8 +238,12 @@ def _import(modules: Iterable[str]) -> None:
             importlib.import_module(name)
 
 
-def _fork(connection: Connection) -> int:
-    """Fork a child that talks to the process that requests it; return its number."""
+def _fork(connection: Connection, scratch: str) -> int:
+    """Fork a child that talks to the process that requests it; return its number.
+
+    All temporary files of the child lie in the folder that is named: those of Python, those of
+    SQLite and those of other libraries.
+    """
     handle = reduction.recv_handle(connection)
     # what is imported stays shared with the child
     gc.freeze()
@@ -229,6 +253,8 @@ def _fork(connection: Connection) -> int:
         return pid
     try:
         connection.close()
+        tempfile.tempdir = scratch
+        os.environ |= dict.fromkeys(TEMPORARY, scratch)
         importlib.import_module(CHILD).serve(Connection(handle))
     finally:
         os._exit(0)

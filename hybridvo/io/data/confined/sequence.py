@@ -6,6 +6,7 @@ import contextlib
 import mmap
 import operator
 import os
+import shutil
 import signal
 import threading
 import weakref
@@ -21,7 +22,7 @@ from hybridvo.core.trajectory import check_increasing
 from hybridvo.core.types import Camera, Frame
 from hybridvo.io.data.bags.topics import Topics
 from hybridvo.io.data.confined import child
-from hybridvo.io.data.confined.fork_server import fork, server
+from hybridvo.io.data.confined.fork_server import Fork, fork, server
 from hybridvo.io.data.confined.limits import CONFINED, MIB, Limits, limits_of
 from hybridvo.io.data.confined.wire import POLL_S, array_at, receive, send
 from hybridvo.io.data.sequence import Files, Sequence
@@ -60,7 +61,7 @@ class _Child:
         self.limits = limits
         self.memory = mmap.mmap(-1, 1)
         self._forked = forked
-        self._close = weakref.finalize(self, forked.connection.close)
+        self._close = weakref.finalize(self, _leave, forked, self.process)
         self._activity = ""
         self._idle = 0.0
 
@@ -122,17 +123,28 @@ class _Child:
 
     def _end(self) -> tuple[str, str]:
         """End the child; return how it had ended, as a word and as a part of a sentence."""
-        self._close()
         try:
             status = server().end(self._forked.pid)
         except (OSError, EOFError):
             status = 0
+        # after its end, so that it writes nothing more
+        self._close()
         number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         if number == signal.SIGXCPU:
             return "time", f"took more than {self.limits.cpu_s} s of processor time"
         if number:
             return "died", f"was ended by {signal.Signals(number).name}"
         return "died", "ended"
+
+
+def _leave(forked: Fork, owner: int) -> None:
+    """Close the way to a child, which ends it, and remove its temporary files.
+
+    A copy of the process that has requested the child leaves the files to that process.
+    """
+    forked.connection.close()
+    if os.getpid() == owner:
+        shutil.rmtree(forked.scratch, ignore_errors=True)
 
 
 def _activity(pid: int) -> str:
@@ -373,6 +385,8 @@ class ConfinedSequence(Sequence):
             shapes = shapes and samples.ndim == 2 and samples.shape[1] == 7
             turned = self.R_cam_imu
             shapes = shapes and turned is not None and turned.shape == (3, 3)
+        if self.T_cam_frame is not None:
+            shapes = shapes and self.T_cam_frame.shape == (4, 4)
         if not shapes:
             raise FormatError("arrays of another shape")
 

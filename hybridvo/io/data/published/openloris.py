@@ -96,7 +96,9 @@ class OpenLorisSequence(TumSequence):
             )
         with format_errors(f"{path}: {COLOUR_FRAME}"):
             size: Any = (sensor.get("height"), sensor.get("width"))
-            return Calibration(Camera(fx, fy, cx, cy, *size), distortion)
+            return Calibration(
+                Camera(fx, fy, cx, cy, height=size[0], width=size[1]), distortion
+            )
 
 
 def _numbers(matrix: Any, count: int | None, where: str) -> np.ndarray:

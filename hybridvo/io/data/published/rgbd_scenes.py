@@ -57,7 +57,7 @@ class RgbdScenesSequence(Sequence):
         return next((path for path in places if path.is_file()), None)
 
     def _calibration(self) -> Calibration:
-        return Calibration(Camera(*INTRINSICS, *SIZE))
+        return Calibration(Camera(*INTRINSICS, height=SIZE[0], width=SIZE[1]))
 
 
 def _read_poses(path: Path) -> np.ndarray:

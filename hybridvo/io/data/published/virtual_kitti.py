@@ -84,7 +84,9 @@ class VirtualKittiSequence(Sequence):
             raise FormatError(f"{path}: expected '{INTRINSIC}', got no row.")
         fx, fy, cx, cy = rows[min(rows)].tolist()
         with format_errors(path):
-            return Calibration(Camera(fx, fy, cx, cy, self.height, self.width))
+            return Calibration(
+                Camera(fx, fy, cx, cy, height=self.height, width=self.width)
+            )
 
     def _read_flow(
         self, path: Path, index: int

@@ -122,7 +122,7 @@ class Record3dSequence(StreamSequence):
         height, width = self._image_size
         with format_errors(f"{self.root}: metadata: camera"):
             cameras = [
-                Camera(fx, fy, cx, cy, height, width)
+                Camera(fx, fy, cx, cy, height=height, width=width)
                 for fx, fy, cx, cy in rows.tolist()
             ]
         return [self._smaller(camera) for camera in cameras]

@@ -10,3 +10,5 @@ class Diagnosis(NamedTuple):
 
     differs: bool | None  # None: the data do not show it
     message: str
+    # that removes the difference, with its value; None where no option does
+    option: tuple[str, str] | None = None

@@ -21,6 +21,7 @@ CLOCK_SHIFT_PX = 2.0
 
 REPEATED = "repeated_frame"
 UNIT = "depth_unit"
+NO_IMAGE = "no_image"
 FEW_DEPTH = "little_depth"
 FEW_TEXTURE = "little_texture"
 BLUR = "blur"
@@ -31,6 +32,7 @@ CAUSES = {
         "many do in the dark"
     ),
     UNIT: "depth is not in metres: --depth-scale",
+    NO_IMAGE: "the file of the image is missing: see that it was copied",
     FEW_DEPTH: "few pixels have depth: distance, sunlight, glass, dark surfaces",
     FEW_TEXTURE: "few pixels have texture: more light, or another view",
     BLUR: "the image is blurred: a shorter exposure, or the focus",
@@ -60,6 +62,9 @@ def likely_cause(
         return ""
     if step.status.reason is Reason.DEPTH_UNIT:
         return UNIT
+    has_images = prev.rgb is not None and curr.rgb is not None
+    if step.status.reason is Reason.NO_FLOW and not has_images:
+        return NO_IMAGE
     if _is_same(prev.rgb, curr.rgb) or _is_same(prev.depth, curr.depth):
         return REPEATED
     depths = [frame.depth for frame in (prev, curr) if frame.depth is not None]

@@ -14,6 +14,22 @@ from hybridvo.run.commands.diagnosis.capture import Captured
 
 # of the rate of a live camera to the one requested, from which it holds
 MIN_RATE_RATIO = 0.9
+MILLISECONDS = (5.0, 1000.0)
+"""Intervals of stamps, s, that nobody tracks, but that are usual in milliseconds."""
+
+
+def seems_in_milliseconds(stamps: np.ndarray) -> bool:
+    """Return whether time stamps (N,), which should be seconds, seem to be milliseconds.
+
+    Example:
+        >>> seems_in_milliseconds(np.arange(9) * 33.3), seems_in_milliseconds(np.arange(9) / 30)
+        (True, False)
+    """
+    intervals = np.diff(stamps)
+    if not len(intervals):
+        return False
+    low, high = MILLISECONDS
+    return low <= float(np.median(intervals)) <= high
 
 
 def gaps(stamps: np.ndarray) -> Diagnosis:
@@ -22,6 +38,14 @@ def gaps(stamps: np.ndarray) -> Diagnosis:
     if len(intervals) < 2:
         return Diagnosis(None, "fewer than three frames")
     usual = float(np.median(intervals))
+    if seems_in_milliseconds(stamps):
+        fps = f"{1000 / usual:.4g}"
+        return Diagnosis(
+            True,
+            f"{1 / usual:.2g} frames a second: stamps seem to be milliseconds, expected seconds: "
+            f"divide them by 1000, or pass --fps {fps}",
+            ("--fps", fps),
+        )
     is_gap = intervals > STAMP_GAP_FACTOR * usual
     text = (
         f"{1 / usual:.3g} frames a second; "

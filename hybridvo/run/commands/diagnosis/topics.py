@@ -31,6 +31,7 @@ ROLES = {
     "rgb_info": "camera of colour",
     "depth_info": "camera of depth",
     "truth": "true poses",
+    "imu": "gyroscope",
 }
 """For what a topic is taken, by the name of the field."""
 

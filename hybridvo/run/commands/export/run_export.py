@@ -77,8 +77,8 @@ class RunExport:
         present = next(_files(self.folder), None)
         if mode == "new" and present is not None:
             raise InputError(
-                f"{self.folder}: holds an export ({present.name}). Pass --overwrite to replace it, "
-                "or another --out."
+                f"{self.folder}: holds an export ({present.name}). Pass another --out, "
+                "or --overwrite to replace it."
             )
 
     @property
