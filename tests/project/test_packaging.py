@@ -100,25 +100,39 @@ def test_messages_name_extras_that_exist() -> None:
             assert name in EXTRAS, f"{path.name}: {name}"
 
 
-def plain_installation() -> dict[str, Distribution]:
-    """What ``pip install hybridvo`` installs, as far as it is installed here."""
+def installed_by(requirements: list[str]) -> dict[str, Distribution]:
+    """What requirements of the project bring, as far as it is installed here."""
     found: dict[str, Distribution] = {}
-    waiting = list(PROJECT["dependencies"])
+    seen = set()
+    # with the extra of the package that asks
+    waiting = [(Requirement(text), "") for text in requirements]
     while waiting:
-        needed = Requirement(waiting.pop())
-        is_needed = needed.marker is None or needed.marker.evaluate({"extra": ""})
-        if not is_needed or needed.name in found:
+        needed, extra = waiting.pop()
+        if needed.marker and not needed.marker.evaluate({"extra": extra}):
+            continue
+        if needed.name == "hybridvo":
+            texts = [text for name in needed.extras for text in EXTRAS[name]]
+            waiting += [(Requirement(text), "") for text in texts]
             continue
         try:
-            found[needed.name] = distribution(needed.name)
+            package = distribution(needed.name)
         except PackageNotFoundError:
             continue
-        waiting += found[needed.name].requires or []
+        name = package.metadata["Name"].lower()
+        found[name] = package
+        for its_extra in {(name, each) for each in ("", *needed.extras)} - seen:
+            seen.add(its_extra)
+            texts = package.requires or []
+            waiting += [(Requirement(text), its_extra[1]) for text in texts]
     return found
 
 
-def test_a_plain_installation_brings_nothing_under_gpl() -> None:
-    packages = plain_installation()
+PLAIN = PROJECT["dependencies"]
+
+
+@pytest.mark.parametrize("requirements", [PLAIN, [*PLAIN, "hybridvo[all]"]])
+def test_an_installation_brings_nothing_under_gpl(requirements: list[str]) -> None:
+    packages = installed_by(requirements)
     assert len(packages) > 20
     for name, package in packages.items():
         data = package.metadata
