@@ -18,13 +18,14 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 
 .PHONY: demo test test-slow test-long test-ros golden golden-quick same-answers walk check format docs tables paper wheel clean
 
+# pip is brought to a version that knows groups of dependencies: 25.1
 # the kernels are compiled on one core while pip installs the rest on the other
 $(STAMP): pyproject.toml hybridvo_lab/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt $(KERNELS_NEED)
+	$(BIN)/python -m $(PIP_INSTALL) -c constraints.txt pip $(KERNELS_NEED)
 	$(BIN)/python -m hybridvo.compiled hybridvo_lab/signatures.json & \
 	$(BIN)/$(PIP_INSTALL) $(TORCH) && \
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[dev,all,cluster]" -e ./hybridvo_lab && wait
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt --group dev -e ".[all,viz,cluster]" -e ./hybridvo_lab && wait
 	touch $(STAMP)
 
 demo: $(STAMP)
@@ -69,7 +70,7 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 docs: $(STAMP)
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e ".[docs]" -e ./hybridvo_lab
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt --group docs
 	$(BIN)/mkdocs build --strict -f configs/mkdocs.yml
 
 tables: $(STAMP)  # every published figure at this commit: docs/results/README.md; leave the machine idle
