@@ -25,7 +25,7 @@ $(STAMP): pyproject.toml hybridvo_lab/pyproject.toml constraints.txt
 	$(BIN)/python -m $(PIP_INSTALL) -c constraints.txt pip $(KERNELS_NEED)
 	$(BIN)/python -m hybridvo.compiled hybridvo_lab/signatures.json & \
 	$(BIN)/$(PIP_INSTALL) $(TORCH) && \
-	$(BIN)/$(PIP_INSTALL) -c constraints.txt --group dev -e ".[all,viz,cluster]" -e ./hybridvo_lab && wait
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt --group dev -e ".[all,viz,kinect,cluster]" -e ./hybridvo_lab && wait
 	touch $(STAMP)
 
 demo: $(STAMP)

@@ -127,6 +127,8 @@ def installed_by(requirements: list[str]) -> dict[str, Distribution]:
     return found
 
 
+GPL_LIBRARY = re.compile(r"libx26[45]\b")
+"""What wheels of FFmpeg may hold, whatever their metadata state."""
 PLAIN = PROJECT["dependencies"]
 
 
@@ -143,6 +145,8 @@ def test_an_installation_brings_nothing_under_gpl(requirements: list[str]) -> No
         ]
         text = " ".join(stated)
         assert not re.search(r"\bA?GPL|GNU (Affero )?General Public", text), name
+        libraries = [file.name for file in package.files or []]
+        assert not [each for each in libraries if GPL_LIBRARY.match(each)], name
 
 
 LARGE = {"rerun-sdk", "pyarrow", "open3d"}
