@@ -149,6 +149,26 @@ def test_an_installation_brings_nothing_under_gpl(requirements: list[str]) -> No
         assert not [each for each in libraries if GPL_LIBRARY.match(each)], name
 
 
+def own_requirements() -> set[str]:
+    """The names of what both distributions and their extras ask for."""
+    lab = tomllib.loads((ROOT / "hybridvo_lab/pyproject.toml").read_text("utf-8"))
+    texts = []
+    for project in (PROJECT, lab["project"]):
+        texts += project["dependencies"]
+        for extra in project["optional-dependencies"].values():
+            texts += extra
+    return {Requirement(text).name for text in texts} - {"hybridvo", "hybridvo-lab"}
+
+
+def test_the_notice_lists_every_package_that_is_asked_for() -> None:
+    notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
+    packages, _ = notice.split("A program that you distribute")
+    # names, in one column or separated by commas, stand before two spaces or a line's end
+    rows = re.findall(r"^    (\S.*?)(?:  .*|\(.*)?$", packages, re.MULTILINE)
+    listed = {name.strip() for row in rows for name in row.split(",")}
+    assert listed == own_requirements()
+
+
 LARGE = {"rerun-sdk", "pyarrow", "open3d"}
 """What each takes a hundred megabytes and more, for one purpose."""
 
