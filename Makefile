@@ -16,7 +16,7 @@ ROS_PACKAGES := python3-roslaunch python3-rosbag python3-message-filters python3
 	python3-sensor-msgs python3-diagnostic-msgs python3-std-srvs python3-tf2-msgs \
 	python3-visualization-msgs python3-rosservice python3-rostopic
 
-.PHONY: demo test test-slow test-long test-ros golden golden-quick same-answers walk check format docs tables paper wheel clean
+.PHONY: demo test test-slow test-long test-ros golden golden-quick same-answers walk check format docs tables paper wheel release-check clean
 
 # pip is brought to a version that knows groups of dependencies: 25.1
 # the kernels are compiled on one core while pip installs the rest on the other
@@ -82,6 +82,26 @@ paper: $(STAMP)  # docs/paper.md from the rows that tools/ablation.py trained in
 
 wheel: $(STAMP)  # two in dist/: Python files alone, and with kernels compiled for this system
 	$(BIN)/python tools/build_wheel.py
+
+# what is published: made from the sdists, installed where nothing else is, used outside of the clone
+RELEASE := runs/release
+define install_alone
+	$(PYTHON) -m venv --clear $(RELEASE)/$(1)
+	$(RELEASE)/$(1)/bin/$(PIP_INSTALL) $(TORCH)
+	$(RELEASE)/$(1)/bin/$(PIP_INSTALL) $(2)
+	$(RELEASE)/$(1)/bin/pip check
+endef
+
+release-check: docs
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt --group release
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m build --outdir dist hybridvo_lab
+	$(BIN)/twine check --strict dist/*
+	$(call install_alone,plain,dist/hybridvo-*.whl)
+	cd $(RELEASE) && plain/bin/hybridvo doctor
+	$(call install_alone,lab,dist/*.whl)
+	cd $(RELEASE) && lab/bin/hybridvo demo --frames 3 --out demo --overwrite
 
 clean:
 	rm -rf $(VENV) build dist runs site
