@@ -45,6 +45,7 @@ PAGE = {
 """Titles of docs/results.md and their tables."""
 FILLED = (
     "install.md",
+    "model-card.md",
     "how-it-works.md",
     "paper.md",
     "scale.md",

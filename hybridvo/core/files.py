@@ -42,7 +42,6 @@ NUMERIC_PACKAGES = (
     "opencv-python-headless",
     "numba",
     "torch",
-    "evo",
     "poselib",
 )
 """Packages on whose versions numbers depend."""

@@ -43,7 +43,7 @@ from hybridvo.run.commands.text import reasons_of
 from hybridvo_lab import baselines
 from hybridvo_lab.cluster import Workers
 from hybridvo_lab.evaluation import protocols, scores
-from hybridvo_lab.evaluation.metrics import missing_library, rpe_over_a_second
+from hybridvo_lab.evaluation.metrics import rpe_over_a_second
 from hybridvo_lab.evaluation.path_scores import paths_summary, score_path
 from hybridvo_lab.evaluation.protocols import Protocol
 from hybridvo_lab.evaluation.report import write_report
@@ -208,11 +208,9 @@ def compare(
 
 
 def _warn_of(missing: Mapping[str, str]) -> None:
-    """Log which methods do not run, and why tables have no errors of paths, if they have none."""
+    """Log which methods do not run."""
     for reason in reasons_of(missing):
         _logger.warning("not run: %s", reason)
-    if reason := missing_library():
-        _logger.warning("no errors of paths (ATE, RPE): %s", reason)
 
 
 def _run_and_score(

@@ -129,11 +129,9 @@ def _moving_fraction(scene: Scene) -> float:
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
     """Return a row of the demo's table from a row of ``results.json``."""
-    ate = row["ate_rmse_origin"]
     return {
         "method": METHODS[row["method"]],
-        # evo, which computes it, may not be installed
-        "ate_cm": None if ate is None else 100.0 * ate,
+        "ate_cm": 100.0 * row["ate_rmse_origin"],
         "rotation_deg": row["rot_err_deg_mean"],
         "epe_px": row["epe_l2_px"],
         "failed": row["failed"],

@@ -1,24 +1,21 @@
-"""Errors of a trajectory against the ground truth: ATE and RPE by evo, drift as KITTI has it."""
+"""Errors of a trajectory against the ground truth: ATE and RPE as evo has them, drift as KITTI.
+
+Tests compare them with evo's, which is under GPL and therefore not used here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from hybridvo.core.checks import as_number
 from hybridvo.core.errors import DegenerateError, InputError
 from hybridvo.core.geometry import invert, make_transform, rotation_angle
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.calibration import MAX_STAMP_DIFFERENCE_S
-
-if TYPE_CHECKING:
-    from evo.core.trajectory import PoseTrajectory3D
 
 # m: a double resolves 0.1 mm there; beyond it errors of millimetres are rounding,
 # and squares of 1e160 overflow
@@ -33,8 +30,6 @@ KITTI_LENGTHS = tuple(range(100, 801, 100))
 """Lengths of the sub-paths of KITTI's odometry benchmark, metres."""
 STAMP_ROUNDING = 1.01
 """Factor on half a frame that allows for the rounding of time stamps."""
-WITHOUT_EVO = "evo is not installed: pip install 'hybridvo[evaluation]'"
-"""Why no error can be computed in an installation without the extra ``evaluation``."""
 
 
 class Match(NamedTuple):
@@ -78,48 +73,28 @@ class RelativeErrors(NamedTuple):
 # -- matching ----------------------------------------------------------------------------
 
 
-def missing_library() -> str:
-    """Return why no error of a path can be computed here; empty where it can."""
-    return "" if find_spec("evo") else WITHOUT_EVO
-
-
-def no_match(reason: str) -> Match:
-    """Return a match of no poses, with the reason why no error can be computed."""
-    none = np.zeros((0, 4, 4))
-    return Match(none, none, np.zeros(0), "", reason)
-
-
 def match(
     est: Trajectory, gt: Trajectory, max_diff: float = MAX_STAMP_DIFFERENCE_S
 ) -> Match:
-    """Match poses by the nearest time stamp (evo), or by index where one path has no time stamps.
+    """Match poses by the nearest time stamp, or by index where one path has no time stamps.
+
+    Each pose of the path with fewer of them gets the nearest one of the other.
 
     Args:
         est: The estimate.
         gt: The ground truth.
         max_diff: Largest difference of stamps that belong together, seconds.
-
-    Returns:
-        The poses; none, with a reason, where evo is not installed.
     """
-    missing = missing_library()
-    if missing:
-        return no_match(missing)
     if not (est.has_timestamps and gt.has_timestamps):
         return _match_by_index(est, gt)
-    from evo.core.sync import SyncException, associate_trajectories
-
-    try:
-        est_matched, gt_matched = associate_trajectories(
-            _evo_path(est), _evo_path(gt), max_diff=max_diff
-        )
-    except SyncException:
-        i = np.zeros(0, dtype=int)
-        j = np.zeros(0, dtype=int)
+    if len(gt) > len(est):
+        j = _nearest(est.timestamps, gt.timestamps, max_diff)
+        i = np.flatnonzero(j >= 0)
+        j = j[i]
     else:
-        # The stamps increase, and thus identify which poses evo has kept.
-        i = np.searchsorted(est.timestamps, est_matched.timestamps)
-        j = np.searchsorted(gt.timestamps, gt_matched.timestamps)
+        i = _nearest(gt.timestamps, est.timestamps, max_diff)
+        j = np.flatnonzero(i >= 0)
+        i = i[j]
     total = min(len(est), len(gt))
     reason = ""
     if len(i) < MIN_MATCHED_RATIO * total:
@@ -130,6 +105,17 @@ def match(
     return Match(
         est.T_world_cam[i], gt.T_world_cam[j], gt.timestamps[j], "time", reason
     )
+
+
+def _nearest(wanted: np.ndarray, stamps: np.ndarray, max_diff: float) -> np.ndarray:
+    """Return the place of the nearest of ``stamps``, which increase; -1 where none is near enough.
+
+    Of two that are as near it is the earlier one.
+    """
+    middles = (stamps[:-1] + stamps[1:]) / 2
+    places = np.searchsorted(middles, wanted)
+    is_near = np.abs(stamps[places] - wanted) <= max_diff
+    return np.where(is_near, places, -1)
 
 
 def _match_by_index(est: Trajectory, gt: Trajectory) -> Match:
@@ -155,27 +141,6 @@ def _span(path: Trajectory) -> str:
     return f"{path.timestamps[0]:.6f} to {path.timestamps[-1]:.6f}"
 
 
-def _evo_path(path: Trajectory) -> PoseTrajectory3D:
-    """Return a trajectory as evo's type."""
-    return _evo_poses(path.T_world_cam, path.timestamps)
-
-
-def _evo_poses(T: np.ndarray, stamps: np.ndarray) -> PoseTrajectory3D:
-    """Return poses (M, 4, 4) with stamps (M,) as evo's type.
-
-    evo gets quaternions, of which it makes exact rotations: it refuses rotations that are off by
-    more than rounding, as those of text files are.
-    """
-    from evo.core.trajectory import PoseTrajectory3D
-
-    rotations = Rotation.from_matrix(T[:, :3, :3])
-    return PoseTrajectory3D(
-        positions_xyz=T[:, :3, 3].copy(),
-        orientations_quat_wxyz=rotations.as_quat(scalar_first=True),
-        timestamps=stamps,
-    )
-
-
 # -- absolute errors ---------------------------------------------------------------------
 
 
@@ -190,42 +155,56 @@ def ate(matched: Match, alignment: Alignment = "se3") -> PathError:
     Raises:
         DegenerateError: The poses do not determine the alignment.
     """
-    from evo.core.metrics import APE, PoseRelation, StatisticsType
-
-    est = _evo_poses(matched.est, matched.stamps)
-    gt = _evo_poses(matched.gt, matched.stamps)
-    T_gt_est, scale = _alignment(est, gt, matched, alignment)
-    est.scale(scale)
-    est.transform(T_gt_est)
-    metric = APE(PoseRelation.translation_part)
-    metric.process_data((gt, est))
-    rmse = float(metric.get_statistic(StatisticsType.rmse))
-    return PathError(metric.error, matched.stamps, rmse, T_gt_est, scale)
+    est = matched.est[:, :3, 3]
+    gt = matched.gt[:, :3, 3]
+    T_gt_est, scale = _alignment(matched, alignment)
+    moved = scale * est @ T_gt_est[:3, :3].T + T_gt_est[:3, 3]
+    distances = np.linalg.norm(moved - gt, axis=1)
+    return PathError(distances, matched.stamps, rms(distances), T_gt_est, scale)
 
 
-def _alignment(
-    est: PoseTrajectory3D,
-    gt: PoseTrajectory3D,
-    matched: Match,
-    alignment: Alignment,
-) -> tuple[np.ndarray, float]:
+def _alignment(matched: Match, alignment: Alignment) -> tuple[np.ndarray, float]:
     """Return the transform (4, 4) and the scale that align an estimate to the ground truth."""
     if alignment == "none":
         return np.eye(4), 1.0
     if alignment == "origin":
         return matched.gt[0] @ invert(matched.est[0]), 1.0
-    from evo.core.geometry import GeometryException, umeyama_alignment
+    return umeyama(
+        matched.est[:, :3, 3], matched.gt[:, :3, 3], with_scale=alignment == "sim3"
+    )
 
-    try:
-        R, t, scale = umeyama_alignment(
-            est.positions_xyz.T,
-            gt.positions_xyz.T,
-            with_scale=alignment == "sim3",
-        )
-    except GeometryException:
+
+def umeyama(
+    points: np.ndarray, targets: np.ndarray, *, with_scale: bool
+) -> tuple[np.ndarray, float]:
+    """Return the transform (4, 4) and the scale s for which T (s p) is nearest to the targets.
+
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 1991.
+
+    Args:
+        points: (N, 3).
+        targets: (N, 3).
+        with_scale: Whether the scale is sought; else it is 1.
+
+    Raises:
+        DegenerateError: The points are fewer than three, or on a line.
+    """
+    centre = points.mean(axis=0)
+    target_centre = targets.mean(axis=0)
+    spread = points - centre
+    covariance = (targets - target_centre).T @ spread / len(points)
+    U, sizes, Vt = np.linalg.svd(covariance)
+    if sizes[1] <= np.finfo(float).eps:
         reason = "not enough poses, or all in one place or on a line: an alignment needs more"
-        raise DegenerateError(reason) from None
-    return make_transform(R, t), float(scale)
+        raise DegenerateError(reason)
+    # a mirror image is no rotation
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ np.diag(signs) @ Vt
+    scale = 1.0
+    if with_scale:
+        scale = float(sizes @ signs / np.mean(np.sum(spread**2, axis=1)))
+    return make_transform(R, target_centre - scale * R @ centre), scale
 
 
 def aligned(est: Trajectory, gt: Trajectory) -> AlignedPath:
@@ -266,9 +245,18 @@ def rpe(
     Raises:
         DegenerateError: No two poses are that far apart, or the poses have no times.
     """
-    if delta_unit == "frames":
-        return _rpe_over_frames(matched, delta)
-    return _rpe_over_seconds(matched, delta)
+    count = len(matched.stamps)
+    if delta_unit == "s":
+        first, last = _a_time_apart(matched, delta)
+    else:
+        # a span may be longer than an integer of numpy holds
+        first = np.arange(max(count - int(delta), 0))
+        last = first + min(int(delta), count)
+    if not len(first):
+        raise DegenerateError(
+            f"not enough poses: of {count} no two are {delta:g} {delta_unit} apart"
+        )
+    return errors_between(matched, first, last)
 
 
 def rpe_over_a_second(estimate: Trajectory, gt: Trajectory) -> dict[str, Any]:
@@ -290,47 +278,17 @@ def rpe_over_a_second(estimate: Trajectory, gt: Trajectory) -> dict[str, Any]:
     return dict(zip(names, values, strict=True))
 
 
-def _rpe_over_frames(matched: Match, delta: float) -> RelativeErrors:
-    """Compute the relative pose errors over a number of frames."""
-    from evo.core.metrics import RPE, PoseRelation, Unit
-
-    count = len(matched.stamps)
-    if delta >= count:
-        raise DegenerateError(_too_short(count, delta, "frames"))
-    est = _evo_poses(matched.est, matched.stamps)
-    gt = _evo_poses(matched.gt, matched.stamps)
-    metric = RPE(
-        PoseRelation.translation_part, int(delta), Unit.frames, all_pairs=True
-    )
-    metric.process_data((gt, est))
-    # evo takes the angle of one matrix after the other, which takes seconds for long paths.
-    rotations = np.stack(metric.E)[:, :3, :3]
-    return RelativeErrors(metric.error, np.degrees(rotation_angle(rotations)))
-
-
-def _rpe_over_seconds(matched: Match, delta: float) -> RelativeErrors:
-    """Compute the relative pose errors over a time, which evo does not offer."""
-    stamps = matched.stamps
-    count = len(stamps)
+def _a_time_apart(matched: Match, delta: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places of poses, and of those that are ``delta`` seconds later."""
     if matched.by != "time":
         raise DegenerateError(
             "a distance in seconds needs timestamps in both trajectories"
         )
-    half_frame = np.median(np.diff(stamps)) / 2 if count > 1 else 0.0
-    first = np.arange(count)
-    # -1 where no stamp is near enough
-    last = pd.Index(stamps).get_indexer(
-        stamps + delta, method="nearest", tolerance=STAMP_ROUNDING * half_frame
-    )
-    is_pair = last > first
-    if not is_pair.any():
-        raise DegenerateError(_too_short(count, delta, "s"))
-    return errors_between(matched, first[is_pair], last[is_pair])
-
-
-def _too_short(count: int, delta: float, unit: str) -> str:
-    """Explain why there is no relative error."""
-    return f"not enough poses: of {count} no two are {delta:g} {unit} apart"
+    stamps = matched.stamps
+    half_frame = np.median(np.diff(stamps)) / 2 if len(stamps) > 1 else 0.0
+    last = _nearest(stamps + delta, stamps, STAMP_ROUNDING * half_frame)
+    first = np.flatnonzero(last > np.arange(len(stamps)))
+    return first, last[first]
 
 
 def errors_between(

@@ -22,8 +22,6 @@ from hybridvo_lab.evaluation.metrics import (
     ate,
     errors_between,
     match,
-    missing_library,
-    no_match,
     rms,
     rpe,
 )
@@ -147,9 +145,6 @@ def match_paths(
     protocol: Protocol, estimate: Trajectory, truth: Trajectory
 ) -> Match:
     """Match the poses of an estimate and of the ground truth as a protocol does."""
-    missing = missing_library()
-    if missing:
-        return no_match(missing)
     has_times = estimate.has_timestamps and truth.has_timestamps
     if protocol.max_difference_s is None or not has_times:
         return match(estimate, truth)

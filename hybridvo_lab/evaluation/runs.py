@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pandas as pd
-
 from hybridvo.core.results import Step
 from hybridvo.core.trajectory import Trajectory
 from hybridvo.core.types import Frame
@@ -42,21 +40,24 @@ def errors_of_step(
 
 
 def errors_of_run(
-    trajectory: Trajectory, truth: Trajectory, steps: pd.DataFrame, alignment: Any
+    trajectory: Trajectory,
+    truth: Trajectory,
+    steps: list[dict[str, Any]],
+    alignment: Any,
 ) -> dict[str, Any]:
     """Compute the errors of a path and of its motions.
 
     Args:
         trajectory: The path.
         truth: The true one.
-        steps: A row for each step, with its errors; the first one has no motion.
+        steps: A row of each step, with its errors; the first one has no motion.
         alignment: Of the absolute error.
 
     Returns:
         The content of ``metrics.json``, but for what a run says of itself.
     """
     path_errors = evaluate(trajectory, truth, alignment=alignment)
-    motions = steps[1:].rename(columns={"motion_ms": "ms"})
+    motions = [{**row, "ms": row["motion_ms"]} for row in steps[1:]]
     motion_errors = pair_scores(pair_table(motions))
     reasons = path_errors["reasons"] | motion_errors["reasons"]
     return path_errors | motion_errors | {"reasons": reasons}

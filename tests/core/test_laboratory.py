@@ -11,6 +11,7 @@ import pytest
 import hybridvo as hvo
 from hybridvo.core import laboratory
 from hybridvo.run.cli import main
+from hybridvo.run.commands.text import text_of
 from tests.project.source_tree import ROOT
 
 
@@ -91,3 +92,14 @@ def test_a_method_that_it_brings_is_refused_with_the_remedy() -> None:
         hvo.InputError, match=r"hybridvo\.evaluate needs hybridvo-lab"
     ):
         hvo.evaluate(None, None)
+
+
+@pytest.mark.parametrize("lack", ["", "no hybridvo_lab"])
+def test_doctor_promises_the_demo_only_with_it(lack) -> None:
+    names = ("packages", "methods", "extras")
+    content = dict.fromkeys(("platform", "kernels"), "") | {"cuda": []}
+    content |= {name: {} for name in names}
+    content["methods"] = {"hybrid": ""}
+    content["extras"] = {"lab": lack}
+    *_, last = text_of("doctor", content).splitlines()
+    assert ("hybridvo demo" in last) == (not lack)

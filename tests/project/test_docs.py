@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import shlex
 
 import pytest
 
 import hybridvo
+from hybridvo.network.weights import PRETRAINED
 from hybridvo.run.commands.arguments import build_parser
+from hybridvo_lab.synthetic.recordings import SPLITS
+from hybridvo_lab.synthetic.turned_windows import TRAINING
 from tests.scripts import ROOT, load_script
 
 PAGES = sorted(
@@ -159,6 +163,21 @@ def test_generated_tables_are_those_of_the_tool():
     page = (ROOT / "docs/results.md").read_text(encoding="utf-8")
     assert made.page(results) == page, "run python tools/make_docs.py"
     assert page.count("\n## ") <= 7
+
+
+def test_the_model_card_has_what_the_weights_were_made_of():
+    page = (ROOT / "docs/model-card.md").read_text(encoding="utf-8")
+    card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
+    for run in (card, card["began_with"]):
+        assert f"{run['updates']} updates" in page
+        assert f"{run['samples']} samples" in page
+    named = re.findall(r"data/[\w/]+\w", card["recordings"])
+    sources = [
+        source.path for place in SPLITS["train"].values() for source in place
+    ]
+    names = [path.rpartition("/")[2] for path in sources]
+    for recording in (*named, *names, *TRAINING):
+        assert f"{recording}`" in page, recording
 
 
 def test_results_say_how_they_were_made_and_stay_small():

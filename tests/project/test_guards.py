@@ -131,11 +131,3 @@ def test_no_file_is_large() -> None:
         and path.stat().st_size > 1_500_000
     }
     assert not large
-
-
-def test_the_parts_of_evo_that_act_on_import_are_never_used() -> None:
-    # evo.tools.settings writes into the home folder, evo.tools.plot sets a backend
-    acting = ("evo.tools.settings", "evo.tools.plot", "evo.main")
-    for path, tree in source.files_of_both().items():
-        for name in source.imported(tree):
-            assert not name.startswith(acting), path

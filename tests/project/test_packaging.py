@@ -100,25 +100,41 @@ def test_messages_name_extras_that_exist() -> None:
             assert name in EXTRAS, f"{path.name}: {name}"
 
 
-def plain_installation() -> dict[str, Distribution]:
-    """What ``pip install hybridvo`` installs, as far as it is installed here."""
+def installed_by(requirements: list[str]) -> dict[str, Distribution]:
+    """What requirements of the project bring, as far as it is installed here."""
     found: dict[str, Distribution] = {}
-    waiting = list(PROJECT["dependencies"])
+    seen = set()
+    # with the extra of the package that asks
+    waiting = [(Requirement(text), "") for text in requirements]
     while waiting:
-        needed = Requirement(waiting.pop())
-        is_needed = needed.marker is None or needed.marker.evaluate({"extra": ""})
-        if not is_needed or needed.name in found:
+        needed, extra = waiting.pop()
+        if needed.marker and not needed.marker.evaluate({"extra": extra}):
+            continue
+        if needed.name == "hybridvo":
+            texts = [text for name in needed.extras for text in EXTRAS[name]]
+            waiting += [(Requirement(text), "") for text in texts]
             continue
         try:
-            found[needed.name] = distribution(needed.name)
+            package = distribution(needed.name)
         except PackageNotFoundError:
             continue
-        waiting += found[needed.name].requires or []
+        name = package.metadata["Name"].lower()
+        found[name] = package
+        for its_extra in {(name, each) for each in ("", *needed.extras)} - seen:
+            seen.add(its_extra)
+            texts = package.requires or []
+            waiting += [(Requirement(text), its_extra[1]) for text in texts]
     return found
 
 
-def test_a_plain_installation_brings_nothing_under_gpl() -> None:
-    packages = plain_installation()
+GPL_LIBRARY = re.compile(r"libx26[45]\b")
+"""What wheels of FFmpeg may hold, whatever their metadata state."""
+PLAIN = PROJECT["dependencies"]
+
+
+@pytest.mark.parametrize("requirements", [PLAIN, [*PLAIN, "hybridvo[all]"]])
+def test_an_installation_brings_nothing_under_gpl(requirements: list[str]) -> None:
+    packages = installed_by(requirements)
     assert len(packages) > 20
     for name, package in packages.items():
         data = package.metadata
@@ -129,6 +145,37 @@ def test_a_plain_installation_brings_nothing_under_gpl() -> None:
         ]
         text = " ".join(stated)
         assert not re.search(r"\bA?GPL|GNU (Affero )?General Public", text), name
+        libraries = [file.name for file in package.files or []]
+        assert not [each for each in libraries if GPL_LIBRARY.match(each)], name
+
+
+def own_requirements() -> set[str]:
+    """The names of what both distributions and their extras ask for."""
+    lab = tomllib.loads((ROOT / "hybridvo_lab/pyproject.toml").read_text("utf-8"))
+    texts = []
+    for project in (PROJECT, lab["project"]):
+        texts += project["dependencies"]
+        for extra in project["optional-dependencies"].values():
+            texts += extra
+    return {Requirement(text).name for text in texts} - {"hybridvo", "hybridvo-lab"}
+
+
+def test_the_notice_lists_every_package_that_is_asked_for() -> None:
+    notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
+    packages, _ = notice.split("A program that you distribute")
+    # names, in one column or separated by commas, stand before two spaces or a line's end
+    rows = re.findall(r"^    (\S.*?)(?:  .*|\(.*)?$", packages, re.MULTILINE)
+    listed = {name.strip() for row in rows for name in row.split(",")}
+    assert listed == own_requirements()
+
+
+LARGE = {"rerun-sdk", "pyarrow", "open3d"}
+"""What each takes a hundred megabytes and more, for one purpose."""
+
+
+def test_no_large_package_comes_unasked() -> None:
+    assert not LARGE & installed_by([*PLAIN, "hybridvo[all]"]).keys()
+    assert {"rerun-sdk", "pyarrow"} <= installed_by(["hybridvo[viz]"]).keys()
 
 
 # --- metadata -------------------------------------------------------------------------------------
@@ -192,8 +239,7 @@ def test_the_wheel_holds_what_it_needs_and_no_more(tmp_path: Path) -> None:
     assert any(name.endswith(".safetensors") for name in names)
     assert not [name for name in names if name.endswith((".pyc", ".nbc", ".nbi"))]
     assert b"hybridvo = hybridvo.run.cli:main" in entry_points
-    for extra in EXTRAS:
-        assert f"Provides-Extra: {extra}\n" in metadata
+    assert re.findall(r"^Provides-Extra: (.*)$", metadata, re.M) == sorted(EXTRAS)
     assert "License-Expression: BSD-3-Clause" in metadata
 
 

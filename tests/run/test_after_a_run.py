@@ -7,7 +7,6 @@ import shlex
 from pathlib import Path
 from typing import Any, ClassVar
 
-import pandas as pd
 import pytest
 
 from hybridvo.run import cli
@@ -57,9 +56,9 @@ def test_elsewhere_there_are_no_colours(monkeypatch: Any, colours: None) -> None
     assert shown(monkeypatch, Terminal(), SUMMARY) == f"{SUMMARY}\n"
 
 
-def motions(*rows: tuple[int, str, float]) -> pd.DataFrame:
-    table = pd.DataFrame(rows, columns=["index", "status", "probability"])
-    return table.assign(reason="")
+def motions(*rows: tuple[int, str, float]) -> list[dict]:
+    names = ("index", "status", "probability")
+    return [dict(zip(names, row, strict=True), reason="") for row in rows]
 
 
 def test_the_least_sure_step_is_a_failed_one_before_an_improbable_one() -> None:
@@ -69,6 +68,9 @@ def test_the_least_sure_step_is_a_failed_one_before_an_improbable_one() -> None:
     assert found is not None and found["frame"] == 3
     found = _least_sure(motions((1, "ok", 0.9), (2, "ok", 0.8), (3, "ok", 0.99)))
     assert found is not None and found["frame"] == 2
+    # what no probability is known of is the least sure
+    found = _least_sure(motions((1, "ok", 0.1), (2, "ok", float("nan"))))
+    assert found is not None and (found["frame"], found["probability"]) == (2, 0.0)
     assert _least_sure(motions()) is None
 
 

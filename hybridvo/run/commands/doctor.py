@@ -6,11 +6,12 @@ import platform
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
+from math import log
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hybridvo.api import estimate
 from hybridvo.compiled.ahead_of_time import compile_ahead
@@ -69,18 +70,8 @@ MIN_PATH_LENGTH_M = 0.01
 # fraction of the pairs whose flow may contradict their images without a report
 MAX_CONTRADICTED = 0.2
 
-COLUMNS = (
-    "depth",
-    "length",
-    "depth_ratio",
-    "contradiction",
-    "valid",
-    "texture",
-    "focus",
-    "edges",
-    "bends",
-)
-"""What is measured of a pair."""
+Rows = dict[int, dict[str, Any]]
+"""What is measured of pairs, by the index of their first frame."""
 STATES = {None: "cannot_tell", True: "differs", False: "agrees"}
 """How an answer is called in the report."""
 NOT_CHECKED = (
@@ -162,7 +153,7 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
             f"{sequence.name}: expected two frames and one pair, got {got}."
         )
     places = np.linspace(0, last, min(pairs, last + 1))
-    rows = {}
+    rows: Rows = {}
     camera = None
     unreadable = []
     for index in np.unique(places.round().astype(int)).tolist():
@@ -173,13 +164,10 @@ def diagnose(sequence: Any, pairs: int = 40) -> dict[str, Any]:
             rows[index] = _measure(sequence, prev, curr)
         except (InputError, OSError) as error:
             unreadable.append(str(error))
-    table = pd.DataFrame(
-        list(rows.values()), index=list(rows), columns=list(COLUMNS)
-    )
-    answers = {name: question(table) for name, question in QUESTIONS.items()}
+    answers = {name: question(rows) for name, question in QUESTIONS.items()}
     clocks = one_clock(sequence, CLOCK_PAIRS * pairs)
     answers["clocks of colour and depth"] = clocks
-    registered = _registration(table, sequence)
+    registered = _registration(rows, sequence)
     if clocks.differs and registered.differs:
         remedy = "put the clocks right first, and look again"
         found = registered.message.partition(":")[0]
@@ -270,7 +258,7 @@ def _asked_fps(camera: LiveCamera, preset: str | Path | None) -> float | None:
 
 
 def _measure(sequence: Sequence, prev: Frame, curr: Frame) -> dict[str, Any]:
-    """Measure a pair: those of ``COLUMNS`` that its frames allow."""
+    """Measure what the frames of a pair allow."""
     row: dict[str, Any] = {}
     if prev.depth is not None:
         row["depth"] = typical_depth(prev.depth)
@@ -320,14 +308,21 @@ def _percent(fraction: float) -> str:
     return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
-def _units(table: pd.DataFrame) -> Diagnosis:
+def _known(rows: Rows, name: str) -> dict[int, Any]:
+    """Return a measurement of all pairs that have it, by the index of their first frame."""
+    found = {frame: row.get(name) for frame, row in rows.items()}
+    return {frame: value for frame, value in found.items() if value is not None}
+
+
+def _units(rows: Rows) -> Diagnosis:
     """Answer whether depth is in metres."""
-    depths = table["depth"].dropna().astype(float)
-    scales = table["length"].dropna().astype(float)
-    if depths.empty:
+    depths = _known(rows, "depth")
+    scales = _known(rows, "length")
+    if not depths:
         return Diagnosis(None, "no frame has valid depth")
-    text = f"median depth {depths.median():.3g} m"
-    fix = depth_unit_fix(float(depths.median()))
+    depth = median(depths.values())
+    text = f"median depth {depth:.3g} m"
+    fix = depth_unit_fix(depth)
     if len(scales) < MIN_SCALE_PAIRS:
         if fix:
             return Diagnosis(
@@ -340,7 +335,7 @@ def _units(table: pd.DataFrame) -> Diagnosis:
             f"true motions (poses.txt) beyond 1 cm: {len(scales)} pairs, "
             f"{MIN_SCALE_PAIRS} needed",
         )
-    low, scale, high = scales.quantile([0.25, 0.5, 0.75]).tolist()
+    low, scale, high = np.percentile([*scales.values()], [25, 50, 75]).tolist()
     text += f"; motions are {scale:.4g} times as long as the poses on file state"
     if abs(scale - 1) <= MAX_SCALE_ERROR or low < 1 < high:
         return Diagnosis(False, text)
@@ -353,14 +348,14 @@ def _units(table: pd.DataFrame) -> Diagnosis:
     return Diagnosis(True, f"{text}: depth: {fix}")
 
 
-def _depth_steps(table: pd.DataFrame) -> Diagnosis:
+def _depth_steps(rows: Rows) -> Diagnosis:
     """Answer whether depth keeps its scale from frame to frame."""
-    ratios = table["depth_ratio"].dropna().astype(float)
-    if ratios.empty:
+    ratios = _known(rows, "depth_ratio")
+    if not ratios:
         return Diagnosis(None, "no pair has a motion and depth in both frames")
-    log_ratios = np.log(ratios.clip(lower=1e-30)).abs()
-    steps = int((log_ratios > DOUBTFUL_SPREAD).sum())
-    k = log_ratios.idxmax()
+    change = {frame: abs(log(max(x, 1e-30))) for frame, x in ratios.items()}
+    steps = sum(size > DOUBTFUL_SPREAD for size in change.values())
+    k = max(change, key=change.__getitem__)
     text = (
         f"depth changes its scale in {steps} of {len(ratios)} pairs, most from frame {k} "
         f"to the next (times {ratios[k]:.3g})"
@@ -371,48 +366,50 @@ def _depth_steps(table: pd.DataFrame) -> Diagnosis:
     return Diagnosis(True, f"{text}: {cause}")
 
 
-def _images_against_flow(table: pd.DataFrame) -> Diagnosis:
+def _images_against_flow(rows: Rows) -> Diagnosis:
     """Answer whether the flow on file moves the images onto each other."""
-    known = table["contradiction"].dropna()
-    if known.empty:
+    known = _known(rows, "contradiction")
+    if not known:
         return Diagnosis(None, "no pair has images and a flow on file")
-    contradicted = known[known != ""]
+    contradicted = [(frame, text) for frame, text in known.items() if text]
     text = (
         f"the flow contradicts the images in {len(contradicted)} of "
         f"{len(known)} pairs"
     )
     if len(contradicted) <= MAX_CONTRADICTED * len(known):
         return Diagnosis(False, text)
-    frame = contradicted.index[0]
-    return Diagnosis(True, f"{text}; frame {frame}: {contradicted.iloc[0]}")
+    frame, reason = contradicted[0]
+    return Diagnosis(True, f"{text}; frame {frame}: {reason}")
 
 
-def _valid_depth(table: pd.DataFrame) -> Diagnosis:
+def _valid_depth(rows: Rows) -> Diagnosis:
     """Answer whether there is enough depth in the frames."""
-    fractions = table["valid"].dropna().astype(float)
-    if fractions.empty:
+    fractions = _known(rows, "valid")
+    if not fractions:
         return Diagnosis(None, "no frame has a depth map")
-    empty = fractions[fractions < EMPTY_DEPTH]
-    text = f"{_percent(fractions.median())} of the pixels in the median frame"
-    if fractions.median() < MIN_VALID_DEPTH:
+    empty = [frame for frame, x in fractions.items() if x < EMPTY_DEPTH]
+    typical = median(fractions.values())
+    text = f"{_percent(typical)} of the pixels in the median frame"
+    if typical < MIN_VALID_DEPTH:
         cause = "distance, sunlight, glass, or a projection that fills one pixel in several"
         return Diagnosis(
             True,
             f"{text}: too few to be sure of a motion; look for {cause}",
         )
-    if len(empty):
-        count = f"{len(empty)} of {len(fractions)} (frame {empty.index[0]})"
+    if empty:
+        count = f"{len(empty)} of {len(fractions)} (frame {empty[0]})"
         remedy = "see that the sensor delivers; the next motion spans such a frame"
         return Diagnosis(True, f"{text}, none in {count}: {remedy}")
     return Diagnosis(False, text)
 
 
-def _texture_and_focus(table: pd.DataFrame) -> Diagnosis:
+def _texture_and_focus(rows: Rows) -> Diagnosis:
     """Answer whether the images have texture, and are sharp."""
-    known = table[["texture", "focus"]].dropna().astype(float)
-    if known.empty:
+    sharp = _known(rows, "focus")
+    if not sharp:
         return Diagnosis(None, "no frame has an image")
-    texture, focus = known.median()
+    texture = median(_known(rows, "texture").values())
+    focus = median(sharp.values())
     text = (
         f"{_percent(texture)} of the pixels have a gradient; sharpness {focus:.2g}"
     )
@@ -422,11 +419,11 @@ def _texture_and_focus(table: pd.DataFrame) -> Diagnosis:
     if focus < MIN_FOCUS:
         remedy = "check focus, exposure, compression, resizing"
         return Diagnosis(True, f"{text}: blurred or enlarged; {remedy}")
-    blurred = known[known["focus"] < MIN_FOCUS]
-    if len(blurred):
+    blurred = [frame for frame, x in sharp.items() if x < MIN_FOCUS]
+    if blurred:
         text += (
-            f"; {len(blurred)} of {len(known)} are blurred, "
-            f"as frame {blurred.index[0]}: a shorter exposure"
+            f"; {len(blurred)} of {len(sharp)} are blurred, "
+            f"as frame {blurred[0]}: a shorter exposure"
         )
     return Diagnosis(False, text)
 
@@ -444,10 +441,10 @@ def _intrinsics(camera: Camera | None) -> Diagnosis:
     )
 
 
-def _focal_length(table: pd.DataFrame) -> Diagnosis:
+def _focal_length(rows: Rows) -> Diagnosis:
     """Answer whether the focal length fits what turns of the camera show."""
     shown = FocalDrift()
-    for bends in table["bends"].dropna():
+    for bends in _known(rows, "bends").values():
         shown = shown.with_bend(bends.focal)
     if shown.is_off:
         return Diagnosis(True, shown.message)
@@ -466,15 +463,15 @@ def _focal_length(table: pd.DataFrame) -> Diagnosis:
     return Diagnosis(None if is_doubtful else False, text)
 
 
-def _registration(table: pd.DataFrame, sequence: Sequence) -> Diagnosis:
+def _registration(rows: Rows, sequence: Sequence) -> Diagnosis:
     """Answer whether the edges of depth lie on those of the images, shifted or enlarged."""
-    answer = registration(table["edges"].dropna().to_list())
+    answer = registration([*_known(rows, "edges").values()])
     if answer.differs is not None:
         return answer
     return zoomed_registration(sequence) or answer
 
 
-QUESTIONS: dict[str, Callable[[pd.DataFrame], Diagnosis]] = {
+QUESTIONS: dict[str, Callable[[Rows], Diagnosis]] = {
     "depth units": _units,
     "depth from frame to frame": _depth_steps,
     "valid depth": _valid_depth,
@@ -482,4 +479,4 @@ QUESTIONS: dict[str, Callable[[pd.DataFrame], Diagnosis]] = {
     "images against flow": _images_against_flow,
     "focal length": _focal_length,
 }
-"""The questions to the table of measurements, by the name of their finding."""
+"""The questions to the measurements, by the name of their finding."""

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import re
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
@@ -82,6 +83,8 @@ from hybridvo.tracking.depth_scale import (
 )
 from hybridvo.tracking.passes import PixelTimes, TimesFinder
 
+Row = dict[str, Any]
+"""What is kept of a step, JSON-ready: the columns of ``steps.csv`` and more."""
 ARRAYS = (
     "index",
     "timestamp",
@@ -465,11 +468,10 @@ class _Run:
         """Write what a finished run leaves beside its steps; returns its summary, JSON-ready."""
         folder = self.folder.path
         options = self.tracker.options.run
-        steps = pd.DataFrame(self.folder.rows)
-        trajectory = self._write_trajectory(steps)
-        summary = _summarise(steps, self.sequence, options)
+        rows = self.folder.rows
+        trajectory = self._write_trajectory()
+        summary = _summarise(rows, self.sequence, options)
         if self.tracker.options.track.objects != "off":
-            rows = self.folder.rows
             write_objects(
                 folder / OBJECTS, [each for row in rows for each in row["objects"]]
             )
@@ -489,7 +491,7 @@ class _Run:
             summary["warnings"].append(NOT_SCORED)
         elif truth is not None:
             metrics = self.scores.errors_of_run(
-                trajectory, truth, steps, options.alignment
+                trajectory, truth, rows, options.alignment
             )
             metrics |= {key: summary[key] for key in RUN_FIELDS}
             write_json(folder / "metrics.json", metrics)
@@ -500,8 +502,8 @@ class _Run:
                 folder / PICTURE,
                 truth=truth,
                 title=_title(summary),
-                states=steps["status"].tolist(),
-                covariances=_position_covariances(steps),
+                states=[row["status"] for row in rows],
+                covariances=_position_covariances(rows),
             )
         hint = hint_of_run(
             self.sequence,
@@ -525,20 +527,19 @@ class _Run:
             "metrics": metrics,
         }
 
-    def _write_trajectory(self, steps: pd.DataFrame) -> Trajectory:
+    def _write_trajectory(self) -> Trajectory:
         """Write the path and the motions of a run; returns the path of the camera."""
         folder = self.folder.path
-        columns: dict[str, Any] = {
-            name: np.array(steps[name].tolist()) for name in ARRAYS
-        }
-        poses = np.array(steps["T_world_cam"].tolist())
-        row_of = {index: i for i, index in enumerate(steps["index"])}
+        rows = self.folder.rows
+        columns: dict[str, Any] = {name: _column(rows, name) for name in ARRAYS}
+        poses = _column(rows, "T_world_cam")
+        row_of = {row["index"]: i for i, row in enumerate(rows)}
         poses = in_one_scale(
             poses,
             columns["T_curr_prev"],
-            [row_of.get(index) for index in steps["prev_index"]],
+            [row_of.get(row["prev_index"]) for row in rows],
             scale_factors(
-                steps["depth_scale"].to_numpy(), steps["scale_change"].to_numpy()
+                _column(rows, "depth_scale"), _column(rows, "scale_change")
             ),
         )
         trajectory = Trajectory(columns["timestamp"], poses)
@@ -552,7 +553,12 @@ class _Run:
         return trajectory
 
 
-def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
+def _column(rows: list[Row], name: str) -> np.ndarray:
+    """Return what stands under a name in every row."""
+    return np.array([row[name] for row in rows])
+
+
+def _position_covariances(rows: list[Row]) -> np.ndarray:
     """Return the covariance of every position since the first one, (N, 3, 3) m^2.
 
     Each motion adds its own to that of the frame from which it was measured. NaN where a motion
@@ -560,21 +566,24 @@ def _position_covariances(steps: pd.DataFrame) -> np.ndarray:
     """
     path = PathCovariance()
     found = []
-    for row in steps.to_dict("records"):
-        prev = row["prev_index"]
-        prev = None if prev is None or np.isnan(prev) else int(prev)
+    for row in rows:
         motion = RelativePose(
             np.array(row["T_curr_prev"]), np.array(row["covariance"])
         )
         T_world_cam = np.array(row["T_world_cam"])
         edge = Edge(
-            int(row["edge_start"]),
+            row["edge_start"],
             np.array(row["T_curr_start"]),
             np.array(row["edge_covariance"]),
         )
-        index = int(row["index"])
-        stamp = row["timestamp"]
-        step = Step(index, stamp, T_world_cam, motion, prev, measured=edge)
+        step = Step(
+            row["index"],
+            row["timestamp"],
+            T_world_cam,
+            motion,
+            row["prev_index"],
+            measured=edge,
+        )
         covariance = position_covariance(path.follow(step), T_world_cam)
         if covariance is None or row["status"] == "failed":
             covariance = np.full((3, 3), np.nan)
@@ -636,22 +645,22 @@ def _title(summary: dict[str, Any]) -> str:
 
 
 def _summarise(
-    steps: pd.DataFrame, sequence: Sequence, options: RunOptions
+    steps: list[Row], sequence: Sequence, options: RunOptions
 ) -> dict[str, Any]:
     """Return the counts, sources, oracles, times and warnings of a run."""
     motions = steps[1:]  # the first frame has none
-    failed = int((motions["status"] == "failed").sum())
-    degraded = int((motions["status"] == "degraded").sum())
+    states = Counter(row["status"] for row in motions)
+    failed = states["failed"]
     failed_fraction = failed / max(len(motions), 1)
-    tracked = motions[motions["reason"] != "missing_frame"]
+    tracked = [row for row in motions if row["reason"] != "missing_frame"]
     medians = {
-        f"{name}_median": float(tracked[name].median()) if len(tracked) else None
+        f"{name}_median": median(row[name] for row in tracked) if tracked else None
         for name in TIMES
     }
-    outcomes = motions[["status", "reason"]].itertuples(index=False)
-    causes = motions["likely_cause"].dropna()
+    outcomes = [(row["status"], row["reason"]) for row in motions]
+    causes = [row["likely_cause"] for row in motions]
     warnings = [*sequence.warnings, *_messages_of_ok(motions)]
-    if motions.empty:
+    if not motions:
         warnings.append("one frame: no motion")
     if failed_fraction > options.max_failed:
         warnings.append(
@@ -664,40 +673,42 @@ def _summarise(
         "motions": len(motions),
         "failed": failed,
         "failed_fraction": failed_fraction,
-        "degraded": degraded,
+        "degraded": states["degraded"],
         "least_sure": _least_sure(tracked),
         "doubts": [*advice_on(outcomes), *likely_causes(causes)],
-        "flow_source": sorted(set(steps["flow_source"]) - {""}),
+        "flow_source": sorted({row["flow_source"] for row in steps} - {""}),
         "depth_source": sequence.depth_source,
         "oracle": _oracles(steps, sequence),
         "depth_scale": _depth_scale(steps),
         **medians,
-        "stages": stage_summary(tracked["stages"]),
+        "stages": stage_summary(row["stages"] for row in tracked),
         "warnings": warnings,
     }
 
 
-def _least_sure(motions: pd.DataFrame) -> dict[str, Any] | None:
+def _least_sure(motions: list[Row]) -> dict[str, Any] | None:
     """Return the frame of the least sure motion and its status; None where there is no motion."""
-    if motions.empty:
+    if not motions:
         return None
-    doubt = motions["status"].map(list(DOUBT).index)
-    by_doubt = motions.assign(
-        doubt=doubt, chance=motions["probability"].fillna(0.0)
-    )
-    worst = by_doubt.sort_values(["doubt", "chance"], kind="stable").iloc[0]
+    worst = min(motions, key=lambda row: (DOUBT.index(row["status"]), _chance(row)))
     return {
-        "frame": int(worst["index"]),
-        "status": str(worst["status"]),
-        "reason": str(worst["reason"]),
-        "probability": float(worst["chance"]),
+        "frame": worst["index"],
+        "status": worst["status"],
+        "reason": worst["reason"],
+        "probability": _chance(worst),
     }
 
 
-def _depth_scale(steps: pd.DataFrame) -> dict[str, float] | None:
+def _chance(row: Row) -> float:
+    """Return the probability of a motion; 0 where it is not known."""
+    probability: float = row["probability"]
+    return 0.0 if math.isnan(probability) else probability
+
+
+def _depth_scale(steps: list[Row]) -> dict[str, float] | None:
     """Return how the scale of depth varied from frame to frame; None where it was not measured."""
-    scales = steps["depth_scale"].to_numpy()
-    changes = steps["scale_change"].to_numpy()
+    scales = _column(steps, "depth_scale")
+    changes = _column(steps, "scale_change")
     if np.all(scales == 1) and np.all(changes == 1):
         return None
     common = common_scales(scales, changes)
@@ -713,19 +724,16 @@ def _depth_scale(steps: pd.DataFrame) -> dict[str, float] | None:
     }
 
 
-def _messages_of_ok(motions: pd.DataFrame) -> list[str]:
+def _messages_of_ok(motions: list[Row]) -> list[str]:
     """Return the first message of a motion that is ok all the same."""
-    noted = motions[(motions["status"] == "ok") & (motions["message"] != "")]
-    return [
-        f"frame {row['index']}: {row['message']}"
-        for row in noted[:1].to_dict("records")
-    ]
+    noted = [row for row in motions if row["status"] == "ok" and row["message"]]
+    return [f"frame {row['index']}: {row['message']}" for row in noted[:1]]
 
 
-def _oracles(steps: pd.DataFrame, sequence: Sequence) -> list[str]:
+def _oracles(steps: list[Row], sequence: Sequence) -> list[str]:
     """Name the inputs of a run that no sensor can give."""
     oracles = []
-    if steps["flow_is_true"].any():
+    if any(row["flow_is_true"] for row in steps):
         oracles.append("true flow")
     if sequence.depth_source == "true":
         oracles.append("true depth")

@@ -380,7 +380,8 @@ def _platform_text(content: Content) -> list[str]:
 
     if DEFAULT_METHOD in ready:
         optional = "what is 'not ready', or 'no extra', is optional"
-        rows.append(("works", f"hybridvo run DIR and hybridvo demo; {optional}"))
+        works = "hybridvo run DIR" + (", hybridvo demo" if "lab" in present else "")
+        rows.append(("works", f"{works}; {optional}"))
     return [f"{label:<{PLATFORM_WIDTH}}{text}" for label, text in rows]
 
 
