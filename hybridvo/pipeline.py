@@ -462,7 +462,7 @@ def first_sure(
     costliest, on the surest pair alone.
 
     Args:
-        pairs: in the order of preference, those over a longer time first.
+        pairs: in the order of preference.
         method: one of :func:`method_names`.
         ctx: options, networks and flow.
         deadline: on the clock of ``time.perf_counter``. After it nothing more is tried once there
@@ -526,7 +526,6 @@ def at_one_time(
 class _Rounds:
     """The answers of a method about some pairs: a round for each source.
 
-    The first source is asked about the pairs in their order, the next one in the opposite order.
     The cheap sources, images and their flow, are asked about every pair; the others about the pair
     of the surest motion alone, and not after the deadline.
 
@@ -559,9 +558,7 @@ class _Rounds:
                 numbers = [max(numbers, key=self._rank)]
             if not numbers or (is_costly and is_late(self._deadline)):
                 return
-            # flow is surest over the shortest time
-            in_order = list(numbers) if done == 0 else numbers[::-1]
-            for number in in_order:
+            for number in list(numbers):
                 try:
                     found = next(self._answers[number])
                 except StopIteration:

@@ -23,7 +23,6 @@ from measuring import ROOT, parser_of
 from paper import ROWS
 
 from hybridvo.core.calibration import MIN_PROBABILITY
-from hybridvo.network.selection import SELECTION_METHODS
 from hybridvo_lab.evaluation.protocols import protocols
 from hybridvo_lab.evaluation.report import number
 
@@ -178,7 +177,6 @@ def tables(results: Results) -> Any:
         "at": paper.at,
         "zero": paper.zero,
         "rows": ROWS,
-        "rules": SELECTION_METHODS,
         "confidence": MIN_PROBABILITY,
         "published": published,
     }

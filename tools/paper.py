@@ -4,6 +4,7 @@
     python tools/paper.py --ablation runs/ablation            # figures, docs/results/paper.json
     python tools/paper.py --ablation runs/ablation --install  # and keep the weights
     python tools/paper.py --cards   # score the rows of hybridvo_lab/weights anew
+    python tools/paper.py --rules --out docs/results/paper_rules.json
 
 Draws the five steps of the data workflow, the saliency of VONet and PWVO
 (integrated gradients), the uncertainty beside the error and the objects' flow,
@@ -25,14 +26,14 @@ import cv2
 import numpy as np
 import torch
 from ablation import without_pairs
-from measuring import ROOT, parser_of, provenance, without_folders
+from measuring import ROOT, parser_of, provenance, store, without_folders
 from safetensors import safe_open
 from safetensors.torch import save
 
 from hybridvo.core.files import atomic_write, write_json
 from hybridvo.flow.colours import longest_flow
 from hybridvo.network.models import load_weights
-from hybridvo.network.selection import select_motion
+from hybridvo.network.selection import SELECTION_METHODS, select_motion
 from hybridvo.network.weights import (
     checksum,
     save_weights,
@@ -105,6 +106,9 @@ def main(argv: list[str] | None = None) -> int:
     if args.cards:
         score_cards(argv)
         return 0
+    if args.rules:
+        store(args.out, provenance("paper.py", argv) | rules_of_shipped(args.pairs))
+        return 0
     if args.ablation is None:
         parser.error("expected --ablation DIR, the output of tools/ablation.py")
     weights = {
@@ -162,7 +166,32 @@ def build_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="only score those rows on the held-out pairs, and write their cards",
     )
+    add(
+        "--rules",
+        action="store_true",
+        help="only measure the selection rules on the PWVO of hybridvo_lab/weights",
+    )
+    add("--out", type=Path, metavar="FILE", help="what --rules writes")
     return parser
+
+
+def rules_of_shipped(pairs: int) -> dict[str, Any]:
+    """Errors of the shipped PWVO by each selection rule, and those of two other rows."""
+    preset = load_preset(ROOT / f"configs/{CARD_PRESET}.yaml", size=(HEIGHT, WIDTH))
+    batches = held_out(preset, PUBLISHED_SEED, pairs)
+
+    def errors_of(name: str, rule: str = "softmax") -> dict[str, Any]:
+        network, _ = load_weights(name)
+        network.options = dataclasses.replace(network.options, input_stride=1)
+        return without_pairs(evaluate_network(network, batches, rule))
+
+    return {
+        "pairs": pairs,
+        "rules": {
+            rule: errors_of("pwvo-paper", rule) for rule in SELECTION_METHODS
+        },
+        "rows": {name: errors_of(name) for name in ("vonet", "pwvo-naive")},
+    }
 
 
 def install(name: str, path: Path) -> None:

@@ -8,6 +8,8 @@ averaged. With s = log U, U the Laplace scale that the network predicts, the met
 ``argmin``      equal weights.
 ``mean``        the mean of all pixels, without patches: PWVO (naive), pixel-wise, VONet.
 ``exp_plus_u``  softmax(+U), as the paper prints it: it prefers the most uncertain pixels.
+``parts``       softmax(-s) with one s for the rotation and one for the translation: one pixel of
+                a patch for each, as the text of the paper has it. The code takes six.
 ``joint``       softmax(-s) with one s for all six numbers, their mean: one pixel a patch.
 
 Where patches have poses by their own pixels, with a covariance each, the start of a refinement
@@ -39,7 +41,9 @@ MIN_SEED_WEIGHT = 1e-2
 # of a pixel without flow or depth, at least: 20 degrees or 20 m
 INVALID_LOG_SCALE = 3.0
 
-SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "joint")
+SELECTION_METHODS = ("softmax", "argmin", "mean", "exp_plus_u", "parts", "joint")
+CHOSEN_TOGETHER = {"parts": 3, "joint": 6}
+"""Components of a motion for which a method chooses one pixel; 1 by default."""
 PATCH_METHODS = ("fused", "surest", "patch_mean")
 PATCH_ROWS = 4
 """Rows of patches by default: the paper has 4x8 patches of 32 pixels in 128x256."""
@@ -63,8 +67,8 @@ def select(maps: PixelwisePrediction, method: str | None = None) -> PoseSeed:
     Args:
         maps: the prediction of a network such as ``PWVO`` for a batch.
         method: for patches ``fused``, ``surest`` or ``patch_mean``; for pixels ``softmax``,
-            ``argmin``, ``mean``, ``exp_plus_u`` or ``joint``; None: ``fused``, and without
-            patches ``softmax``.
+            ``argmin``, ``mean``, ``exp_plus_u``, ``parts`` or ``joint``; None: ``fused``, and
+            without patches ``softmax``.
 
     Returns:
         The motions (B, 4, 4), and the weights (B, H, W) of their pixels, in (0, 1], with the
@@ -245,16 +249,17 @@ def _usable_values(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Motion and log scales with 0 where one is not finite, and where both are.
 
-    For the method ``joint`` the six components of a pixel have one log scale.
+    The components of a pixel that are chosen together have one log scale.
     """
     usable = torch.isfinite(motion) & torch.isfinite(s)
-    if method == "joint":
-        usable = usable.all(dim=1, keepdim=True).expand_as(usable)
+    size = CHOSEN_TOGETHER.get(method, 1)
+    # (B, groups, components of a group, h, w)
+    usable = usable.unflatten(1, (-1, size)).all(dim=2, keepdim=True)
+    usable = usable.expand(-1, -1, size, -1, -1).flatten(1, 2)
     motion = torch.where(usable, motion, 0.0)
     s = torch.where(usable, s, 0.0).clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)
-    if method == "joint":
-        s = s.mean(dim=1, keepdim=True).expand_as(s)
-    return motion, s, usable
+    s = s.unflatten(1, (-1, size)).mean(dim=2, keepdim=True)
+    return motion, s.expand(-1, -1, size, -1, -1).flatten(1, 2), usable
 
 
 def _logits(s: torch.Tensor, method: str) -> torch.Tensor:

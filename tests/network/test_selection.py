@@ -30,6 +30,8 @@ def by_loop(value, s, method, patch):
     _, height, width = value.shape
     if method == "joint":
         s = np.broadcast_to(s.mean(axis=0), s.shape)
+    elif method == "parts":
+        s = np.stack([s[:3].mean(axis=0)] * 3 + [s[3:].mean(axis=0)] * 3)
     out = []
     for c in range(6):
         if method == "mean":
@@ -80,6 +82,7 @@ def worked_example() -> PixelwisePrediction:
         ("argmin", (1 + 4) / 2),
         ("mean", (1 + 4 + 6 * 9) / 8),
         ("exp_plus_u", (1 + math.e * 4) / (1 + math.e)),  # exp(1), exp(2)
+        ("parts", (2 * 1 + 1 * 4) / 3),
         ("joint", (2 * 1 + 1 * 4) / 3),  # all six have the same U here
     ],
 )
@@ -142,7 +145,7 @@ def test_gradcheck(method):
         return select_pose(PixelwisePrediction(*values), method, 2)
 
     torch.autograd.gradcheck(pose, maps)
-    if method in ("softmax", "exp_plus_u", "joint"):
+    if method in ("softmax", "exp_plus_u", "parts", "joint"):
         pose(*maps).sum().backward()
         assert maps[1].grad.abs().sum() > 0
 
