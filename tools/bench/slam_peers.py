@@ -231,7 +231,8 @@ def by_system(package: str, folder: Path, built: Built) -> Tracked | None:
     if package == "depthai":
         spec = importlib.util.find_spec(package)
         assert spec is not None and spec.origin is not None
-        libraries = Path(spec.origin).parent.glob("**/libdepthaicore*.so")
+        packages = Path(spec.origin).parent
+        libraries = packages.glob("depthai.libs/libdepthaicore*.so")
         preloaded = [str(built.shim), *map(str, libraries)]
         environment["LD_PRELOAD"] = ":".join(preloaded)
     with tempfile.TemporaryDirectory() as out:
