@@ -30,6 +30,7 @@ TOOLS = (
     "lost",
     "sigmas",
     "peers",
+    "slam_peers",
     "t265",
     "live",
     "scale",

@@ -36,7 +36,7 @@ PAGE = {
         "semi_real",
     ),
     "Known noise": ("scenarios", "model_noise"),
-    "Recorded sequences": ("real", "wide_steps", "tracked_peers"),
+    "Recorded sequences": ("real", "wide_steps", "tracked_peers", "slam_static"),
     "Whole sequences": ("sequences", "memory", "video_rate", "lost"),
     "Time and memory": ("costs", "recorded"),
     "How these figures were made": ("measured",),

@@ -15,8 +15,6 @@ TRAINED = {"ablation", "ablation_full", "ablation_long", "paper"}
 """Files of networks that train for hours."""
 SWEPT = {"numbers"}
 """File of ``tools/calibrate.py --numbers``, which takes hours as well."""
-OUTSIDE = {"slam_peers"}
-"""File of figures that were measured with programs outside of this repository."""
 
 
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
@@ -33,7 +31,7 @@ def test_a_tool_takes_the_options_of_its_part(part):
 
 def test_every_file_of_figures_belongs_to_a_part():
     files = {path.stem for path in (ROOT / "docs/results").glob("*.json")}
-    assert files - TRAINED - SWEPT - OUTSIDE == {part.file for part in PARTS}
+    assert files - TRAINED - SWEPT == {part.file for part in PARTS}
     template = (ROOT / "tools/templates/tables.md").read_text("utf-8")
     used = set(re.findall(r"results\.benchmark\.(\w+)", template))
     command = " ".join(part.options for part in PARTS if part.tool == "methods")

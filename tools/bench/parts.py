@@ -85,6 +85,7 @@ PARTS = (
          "benchmark", "costs", 4, alone=True),
     Part("live", "live", "", "live", "", 3, alone=True),
     Part("lost", "lost", "--methods hybrid,classical", "lost", "", 2, alone=True),
+    Part("slam_peers", "slam_peers", "", "slam_peers", "", 15, alone=True),
     Part("wheels", "install", "--parts wheels,speed --repeats 3 --wheels runs/tables/dist",
          "install", "speed", 5, alone=True, before="build_wheel.py --out runs/tables/dist"),
     Part("install", "install", "--repeats 4", "install", "", 3, alone=True),
