@@ -11,7 +11,7 @@ from tests.scripts import ROOT, load_script
 tables = load_script("tools/tables.py")
 benchmark = load_script("tools/benchmark.py")
 PARTS = tables.PARTS
-TRAINED = {"ablation", "ablation_full", "ablation_long", "paper"}
+TRAINED = {"ablation", "ablation_full", "ablation_long", "paper", "paper_rules"}
 """Files of networks that train for hours."""
 SWEPT = {"numbers"}
 """File of ``tools/calibrate.py --numbers``, which takes hours as well."""
