@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -442,6 +443,8 @@ def test_the_code_of_the_librarys_page_runs(
         "accelerations": np.array([[0.0, -9.81, 0.0]] * 2),
     }
     for code in blocks("library.md"):
+        if "import gtsam" in code and find_spec("gtsam") is None:
+            continue
         code = code.replace("path/to/sequence", str(image_walk))
         exec(code.replace("path.tum", str(tmp_path / "path.tum")), names)
     # a motion starts from the frame before, or from an earlier one that is surer

@@ -92,7 +92,7 @@ def _description(
     upper = kind.get("maximum")
     constraint = ""
     if "enum" in kind:
-        constraint = f"one of {', '.join(kind['enum'])}"
+        constraint = f"one of {', '.join(map(str, kind['enum']))}"
     if kind["type"] == "number" and "exclusiveMinimum" in kind:
         # the limits of a ROS parameter are among its values
         constraint = f"more than {lower:g}"

@@ -126,7 +126,7 @@ def test_the_tool_draws_a_pair(folder: Path, tmp_path: Path, capsys) -> None:
     assert picture.shape[0] > 800 and picture.shape[1] > 1000
     before = out.read_bytes()
     assert main(["show", *arguments, "--out", str(out)]) == 2
-    assert "pass --overwrite" in capsys.readouterr().err
+    assert "pass another name as --out" in capsys.readouterr().err
     assert out.read_bytes() == before
 
 
