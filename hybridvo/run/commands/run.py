@@ -180,8 +180,9 @@ def run(
         )
 
     tracker = make_tracker()
-    # Compiling takes long, and must not happen while the folder is locked.
+    # Both take long, and must not happen while the folder is locked.
     tracker.warm_up()
+    scores = _scores_of_runs()
     header = _header(sequence, options, models, command)
     with locked_folder(out), contextlib.ExitStack() as stack:
         folder = RunFolder(out, header, mode)
@@ -210,6 +211,7 @@ def run(
                 folder,
                 TimesFinder(times),
                 export=exporter,
+                scores=scores,
             )
             truth = None
             if recording_path is not None or view is not None:
@@ -328,7 +330,7 @@ class _Run:
     export: RunExport | None = None
     warnings_shown: int = 0
     # of hybridvo-lab: errors and the picture; None where it is not installed
-    scores: Any = field(default_factory=_scores_of_runs)
+    scores: Any = None
 
     def __post_init__(self) -> None:
         self.ahead = FramesAhead(self.sequence, self.frames)
