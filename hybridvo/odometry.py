@@ -89,7 +89,14 @@ class Odometry(Tracker):
         self.things = things or Things()
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
-        """Set the pose of the camera; see :meth:`Tracker.set_pose`."""
+        """Set the pose of the camera, at the start or after a loop closure.
+
+        Args:
+            T_world_cam: (4, 4) camera to world, metres.
+
+        Raises:
+            InputError: for a matrix that is not rigid.
+        """
         T_last_world = invert(self.state.T_world_last)
         super().set_pose(T_world_cam)
         once = self._given_once
@@ -106,9 +113,27 @@ class Odometry(Tracker):
         imu: ImuSamples | None = None,
         following: Frame | None = None,
     ) -> Step:
-        """Track the next frame; see :meth:`Tracker.track`.
+        """Track the next frame; the motion of the first one is the identity, with status ok.
 
-        With ``track.lag`` the step of the frame before is given once more, as ``corrected``.
+        Args:
+            frame: its arrays are copied.
+            flow: where it is known: a FlowField or (H, W, 2) px, from ``state.frame`` to this one.
+            prior: what is known of the motion from ``state.frame``, for instance by a gyroscope
+                (:func:`hybridvo.gyro_prior`) or wheels; by default constant velocity. It also
+                bridges a motion that fails.
+            imu: samples since the frame before. Without a prior their rotation, with the velocity
+                before, is what is expected. It also takes part in the motion that is found, by
+                its covariance; the bias of the sensor is learned from sure steps. If they have
+                accelerations, the step has ``gravity``.
+            following: the frame after it, where that is known. Where the camera states times of
+                its pixels (``readout_ms``, ``depth_lag_ms``), it shows the velocity at this one.
+
+        Returns:
+            The step, whose ``prev_index`` is the frame from which its motion starts. With
+            ``track.lag``, its ``corrected`` is the step of the frame before once more.
+
+        Raises:
+            InputError: for what is no frame or prior; the tracker is as it was.
         """
         check_kind("Odometry.track", frame, Frame)
         if not self.options.track.lag or flow is not None or following is not None:
@@ -135,7 +160,21 @@ class Odometry(Tracker):
         reason: Reason = Reason.MISSING_FRAME,
         prior: MotionPrior | None = None,
     ) -> Step:
-        """Pass over a frame that could not be read; see :meth:`Tracker.skip`."""
+        """Pass over a frame that could not be read; the next motion spans it.
+
+        Args:
+            index: number of the frame.
+            timestamp: seconds.
+            message: why it could not be read.
+            reason: the same as a reason.
+            prior: what is known of the motion from ``state.frame``, which bridges this one.
+
+        Returns:
+            The step, whose motion failed.
+
+        Raises:
+            InputError: for an index or a timestamp that is no number, and for what is no prior.
+        """
         self._given_once = None
         return super().skip(index, timestamp, message, reason, prior)
 
