@@ -12,10 +12,6 @@ MIN_FLOW_COVERAGE = 0.1
 """Fraction of the flow that is the same in both directions, below which it is not searched: 0.0 to
 0.05 of steps that are too wide, 0.2 and more of others (turning Kinect, rooms, people on a tripod,
 turned windows; ``tools/benchmark.py wide_steps``). It saves 350 ms of a step that is too wide."""
-SAME_FLOW = 1 / 320
-"""Distance of two flows, as a fraction of the image's width, below which they are of one motion. By
-hand: where most of DIS's flow is that of matched features, flow from these showed nothing new on
-any recording (fr1_rpy, D435, KITTI)."""
 
 # Rolling shutters
 

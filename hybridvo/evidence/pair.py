@@ -9,11 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from hybridvo.core.belief import Belief
-from hybridvo.core.geometry import ego_flow
 from hybridvo.core.options import Options
 from hybridvo.core.results import MotionPrior, Reason, StageFailed
 from hybridvo.core.types import FramePair
-from hybridvo.evidence.calibration import MIN_FLOW_COVERAGE, SAME_FLOW
+from hybridvo.evidence.calibration import MIN_FLOW_COVERAGE
 from hybridvo.evidence.remembered import Remembered, carried_belief
 from hybridvo.flow.providers import FlowProvider, contradiction, dis_flow, with_flow
 from hybridvo.hypotheses.generate import generate
@@ -86,17 +85,13 @@ class PairEvidence:
 
         Flow that is not computed from these images cannot be computed from another start.
         """
-        first = FlowEvidence(self.with_flow, self)
-        yield first
+        yield FlowEvidence(self.with_flow, self)
         provider = self.provider if self.pair.flow is None else dis_flow()
         is_off = self.options.search.matches == "off"
         if is_off or not self.flow_is_of_the_images or provider is None:
             return
         without_flow = replace(self.pair, flow=None)
         for T in self.matched_motions:
-            if first.shows(T):
-                # flow from there would be the same
-                continue
             guided = with_flow(without_flow, GuidedFlow(provider, T))
             if guided.flow is not None:
                 yield FlowEvidence(guided, self, T)
@@ -129,17 +124,6 @@ class FlowEvidence:
         return generate(
             self.pair, self._starts, self.of.options, self.of.seed, self.of.weights
         )
-
-    def shows(self, T_curr_prev: np.ndarray) -> bool:
-        """Whether most of the flow is that of a motion (4, 4)."""
-        prev = self.pair.prev
-        if self.pair.flow is None or prev.depth is None:
-            return False
-        ego = ego_flow(prev.depth, T_curr_prev, prev.camera, self.pair.curr.camera)
-        distance = np.linalg.norm(ego - self.pair.flow, axis=2)
-        is_known = np.isfinite(distance)
-        is_near = distance < SAME_FLOW * prev.camera.width
-        return int(np.sum(is_near)) > 0.5 * int(np.sum(is_known))
 
     @property
     def _starts(self) -> np.ndarray:
