@@ -87,6 +87,12 @@ class Context:
     flow: FlowProvider | None = None
     seed: int = 0
 
+    @property
+    def looking(self) -> Context:
+        """The same where images alone are not asked: they are sure of what fills the view."""
+        direct = replace(self.options.direct, mode="off")
+        return replace(self, options=replace(self.options, direct=direct))
+
     def evidence(
         self,
         pair: FramePair,

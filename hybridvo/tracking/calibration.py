@@ -49,9 +49,6 @@ MIN_WORLD_IN_VIEW = 0.2
 """Fraction of a remembered view that must be inside the current one before it says anything."""
 MAX_HIDDEN_FRAMES = 90
 """Frames for which a hidden scene is waited for, three seconds at 30 Hz."""
-APART = 60.0
-"""Squared distance of two motions, in their covariances, from which they are two: six where both
-state rightly how much they err. By hand."""
 
 # -- depth whose scale changes from frame to frame ---------------------------------------
 

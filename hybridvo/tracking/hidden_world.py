@@ -7,22 +7,17 @@ camera's motion what stands is seen again, or out of view, or hidden by what sta
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from hybridvo import pipeline
 from hybridvo.core.calibration import KNOWN_LOG_ODDS
-from hybridvo.core.geometry import invert, squared_distance, transform_points
+from hybridvo.core.geometry import invert, transform_points
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.solver.calibration import HIDDEN_SIGMAS
 from hybridvo.solver.points import points_of
 from hybridvo.solver.visibility import visibility
-from hybridvo.tracking.calibration import (
-    APART,
-    MAX_HIDDEN_FRAMES,
-    MIN_WORLD_IN_VIEW,
-)
+from hybridvo.tracking.calibration import MAX_HIDDEN_FRAMES, MIN_WORLD_IN_VIEW
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.memory import Memory
 from hybridvo.tracking.search import Arrival, Estimate, Setup
@@ -62,29 +57,20 @@ def by_scene_behind(
         found: the motion by what was taken for the scene.
 
     Returns:
-        The motion that a look at the pair alone is sure of; None where that is the one found, or
-        nothing hides the scene.
+        The motion that a look at the pair alone is sure of; None where there is none, or nothing
+        hides the scene.
     """
     if arrival.flow is not None or not setup.remembers:
         return None
     if not found.motion.usable or not hides_what_moves(state.memory, state.places):
         return None
     start = min((*found.keyframes, found.start), key=lambda each: each.count)
-    options = setup.context.options
-    looking = replace(options, direct=replace(options.direct, mode="off"))
-    context = replace(setup.context, options=looking)
+    context = setup.context.looking
     pair = FramePair(start.frame, arrival.frame, None)
     motion = pipeline.run_method(
         context.evidence(pair), setup.method, context, arrival.deadline
     )
-    if not motion.ok:
-        return None
-    T_found = invert(start.T_world_cam) @ found.T_world_cam
-    covariance = motion.covariance + found.motion.covariance
-    apart = squared_distance(motion.T_curr_prev, invert(T_found), covariance)
-    if apart < APART:
-        return None
-    return Estimate(start, motion, (start,))
+    return Estimate(start, motion, (start,)) if motion.ok else None
 
 
 def hides_what_moves(memory: Memory | None, places: Sequence[Keyframe]) -> bool:

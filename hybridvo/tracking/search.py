@@ -240,16 +240,14 @@ class Pairs:
         if near is not None:
             near = near @ self._T_ref_start(start)
         if self._asks_for_a_look:
-            direct = replace(context.options.direct, mode="off")
-            options = replace(context.options, direct=direct)
-            context = replace(context, options=options)
+            context = context.looking
         return context.evidence(
             pair, expected, remembered=self._remembered(start), near=near
         )
 
     @property
     def _asks_for_a_look(self) -> bool:
-        """Whether nothing is known of the scene: images alone are sure of what fills the view."""
+        """Whether nothing is known of the scene."""
         memory = self.state.memory
         is_known = memory is not None and memory.belief.is_ready
         is_free = self.setup.options.direct.mode == "auto"
