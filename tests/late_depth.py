@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from hybridvo.core.geometry import se3_exp
+from hybridvo.core.geometry import invert, se3_exp, se3_log
 from hybridvo.core.types import Frame
 from hybridvo_lab.synthetic.render import Scene
 from hybridvo_lab.synthetic.scenes import make_scene
@@ -81,6 +82,17 @@ def late_frames(seed: int, lag_ms: float, count: int) -> list[Frame]:
 
 
 def untold(frames: list[Frame]) -> list[Frame]:
-    """The same frames, whose camera states no lag."""
-    camera = replace(frames[0].camera, depth_lag_ms=0.0)
+    """The same frames, whose camera states no times of its pixels."""
+    camera = replace(frames[0].camera, readout_ms=0.0, depth_lag_ms=0.0)
     return [replace(frame, camera=camera) for frame in frames]
+
+
+def median_error_px(poses: Sequence[np.ndarray]) -> float:
+    """Median error of the rotation from frame to frame, as a shift of the middle of the view."""
+    errors = []
+    for k in range(1, len(poses)):
+        there = [motion_until(PERIOD_S * at) for at in (k - 1, k)]
+        true = invert(there[1]) @ there[0]
+        found = invert(poses[k]) @ poses[k - 1]
+        errors.append(np.linalg.norm(se3_log(found @ invert(true))[3:]))
+    return float(120 * np.median(errors))

@@ -43,16 +43,13 @@ class Taken(NamedTuple):
 class ReadoutFinder:
     """What frames, handed in one by one, show of the readout.
 
-    Args:
-        last: how many pairs count, the latest ones; None: all.
-
     Attributes:
         window: the last frames.
     """
 
-    def __init__(self, last: int | None = None) -> None:
+    def __init__(self) -> None:
         self.window: deque[Taken] = deque(maxlen=NEIGHBOURS)
-        self._bends: deque[Bend] = deque(maxlen=last)
+        self._bends: list[Bend] = []
 
     def add(self, taken: Taken, may_show: bool = True) -> None:
         """Take note of the next frame.

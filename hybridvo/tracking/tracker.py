@@ -8,14 +8,14 @@ import time
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hybridvo import pipeline
 from hybridvo.core.checks import as_number, as_rigid, as_seed, check_kind
 from hybridvo.core.errors import InputError
-from hybridvo.core.geometry import ego_flow, se3_exp
+from hybridvo.core.geometry import ego_flow, invert, se3_exp
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
@@ -28,6 +28,7 @@ from hybridvo.core.results import (
 from hybridvo.core.stages import stage
 from hybridvo.core.types import Camera, Frame, FramePair
 from hybridvo.core.unchecked import changed
+from hybridvo.evidence.one_time import states_times
 from hybridvo.evidence.pair import FlowEvidence
 from hybridvo.flow.providers import (
     FlowField,
@@ -36,13 +37,31 @@ from hybridvo.flow.providers import (
 )
 from hybridvo.network.models import Models, default_models
 from hybridvo.tracking.accelerometer import Accelerometer
+from hybridvo.tracking.camera_drift import Mean
 from hybridvo.tracking.gyroscope import Gyroscope
+from hybridvo.tracking.readout import ReadoutFinder, Taken, surely_ms
 from hybridvo.tracking.repeated import repeat_of
 from hybridvo.tracking.search import Arrival, Setup
 from hybridvo.tracking.step import fallback, follow
 from hybridvo.tracking.tracker_state import Sensors, TrackerState
 
 _logger = logging.getLogger(__name__)
+
+
+class _Asked(NamedTuple):
+    """A frame, and what is known of the motion to it."""
+
+    frame: Frame
+    prior: MotionPrior | None
+    imu: ImuSamples | None
+
+
+class _Given(NamedTuple):
+    """A frame whose step was given, and what it takes to find that once more."""
+
+    known: tuple[Any, ...]  # before it
+    asked: _Asked
+    is_stated: bool  # the times of its pixels, by its camera
 
 
 class Tracker:
@@ -96,6 +115,8 @@ class Tracker:
         """Forget everything: the next frame is the first one, at the identity."""
         self.state = TrackerState()
         self._warned_of_clock = False
+        self._given_once: _Given | None = None
+        self._readout = ReadoutFinder()
 
     def set_pose(self, T_world_cam: np.ndarray) -> None:
         """Set the pose of the camera, at the start or after a loop closure.
@@ -107,6 +128,12 @@ class Tracker:
             InputError: for a matrix that is not rigid.
         """
         T = as_rigid(T_world_cam, "Odometry.set_pose")
+        once = self._given_once
+        if once is not None:
+            before, *rest = once.known
+            T_now_before = invert(self.state.T_world_last) @ before.T_world_last
+            known = (before.moved(T @ T_now_before), *rest)
+            self._given_once = once._replace(known=known)
         self.state = self.state.moved(T)
 
     def resume(self, state: TrackerState) -> None:
@@ -120,6 +147,22 @@ class Tracker:
         """
         check_kind("Odometry.resume", state, TrackerState)
         self.state = state
+        self._given_once = None
+
+    @property
+    def _known(self) -> tuple[Any, ...]:
+        """All that a later step depends on: what :meth:`resume` takes."""
+        return (self.state,)
+
+    @property
+    def readout(self) -> Mean | None:
+        """What ``track.lag`` has found of the readout, ms; None: too little."""
+        return self._readout.mean()
+
+    @property
+    def readout_ms(self) -> float:
+        """How long the rows of an image surely take, ms, as ``track.lag`` finds it; else 0."""
+        return surely_ms(self.readout)
 
     def warm_up(self) -> None:
         """Compile and load everything before the first frame.
@@ -162,7 +205,8 @@ class Tracker:
                 its pixels (``readout_ms``, ``depth_lag_ms``), it shows the velocity at this one.
 
         Returns:
-            The step, whose ``prev_index`` is the frame from which its motion starts.
+            The step, whose ``prev_index`` is the frame from which its motion starts. With
+            ``track.lag``, its ``corrected`` is the step of the frame before once more.
 
         Raises:
             InputError: for what is no frame or prior; the tracker is as it was.
@@ -172,12 +216,59 @@ class Tracker:
             check_kind("Odometry.track: prior", prior, MotionPrior)
         check_kind("Odometry.track: imu", imu, ImuSamples, type(None))
         check_kind("Odometry.track: following", following, Frame, type(None))
+        frame = deepcopy(frame)
+        if self.options.track.lag and flow is None and following is None:
+            return self._track_and_correct(_Asked(frame, prior, imu))
+        self._given_once = None
+        return self._track(_Asked(frame, prior, imu), flow, following)
+
+    def _track_and_correct(self, asked: _Asked) -> Step:
+        """Track a frame, and the frame before once more, now that it is known what follows."""
+        is_stated = states_times(asked.frame.camera)
+        if not is_stated and self.readout_ms:
+            camera = replace(asked.frame.camera, readout_ms=self.readout_ms)
+            asked = asked._replace(frame=changed(asked.frame, camera=camera))
+        corrected = None
+        once = self._given_once
+        if once is not None:
+            self.resume(*once.known)
+            corrected = self._track(once.asked, None, asked.frame)
+            if not once.is_stated:
+                self._learn_readout(once.asked.frame, corrected)
+        known = self._known
+        step = self._track(asked)
+        if states_times(asked.frame.camera) and step.prev_index is not None:
+            # as it is numbered
+            frame = changed(asked.frame, index=step.index)
+            asked = asked._replace(frame=frame)
+            self._given_once = _Given(known, asked, is_stated)
+        elif not is_stated:
+            self._learn_readout(asked.frame, step)
+        return replace(step, corrected=corrected)
+
+    def _learn_readout(self, frame: Frame, step: Step) -> None:
+        """Learn what a frame shows of the readout, with its last step."""
+        readout_ms = frame.camera.readout_ms
+        last = self.state.frame
+        if last is not None and last.index == step.index:
+            # as it was tracked
+            frame = last
+        is_old = step.status.reason is Reason.REPEATED_FRAME
+        self._readout.add(Taken(frame, step, is_old, readout_ms))
+
+    def _track(
+        self,
+        asked: _Asked,
+        flow: FlowField | np.ndarray | None = None,
+        following: Frame | None = None,
+    ) -> Step:
+        """Track a frame, whose step stays as it is."""
+        frame, prior, imu = asked
         before = self.state
         sensors = before.sensors
         gyroscope = sensors.gyroscope
         if imu is not None:
             gyroscope = (gyroscope or Gyroscope()).after(imu)
-        frame = deepcopy(frame)
         if frame.index is None:
             frame = changed(frame, index=before.count)
         repeat = repeat_of(sensors.last, frame)
@@ -283,6 +374,7 @@ class Tracker:
             raise InputError(
                 f"Odometry.skip: expected an index and finite seconds, got {got}."
             )
+        self._given_once = None
         state = self.state
         why = message or "the frame cannot be read"
         motion = RelativePose.failed(reason, why, self.method)

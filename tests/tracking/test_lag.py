@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import hybridvo as hvo
-from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.core.geometry import se3_exp
 from hybridvo.core.options import Options, TrackOptions
 from hybridvo.odometry import Odometry
-from tests.late_depth import PERIOD_S, motion_until, rolling_frames
+from tests.late_depth import median_error_px, rolling_frames, untold
 
 READOUT_MS = 20.0
 COUNT = 60
@@ -24,12 +24,6 @@ def rolled() -> list[hvo.Frame]:
     return rolling_frames(1, READOUT_MS, 0.0, COUNT)
 
 
-def untold(frames: list[hvo.Frame]) -> list[hvo.Frame]:
-    """The same frames, whose camera states no readout."""
-    camera = replace(frames[0].camera, readout_ms=0.0)
-    return [replace(frame, camera=camera) for frame in frames]
-
-
 def poses_of(steps: list[hvo.Step]) -> list[np.ndarray]:
     """The path, each pose as it was given last."""
     poses = {}
@@ -38,17 +32,6 @@ def poses_of(steps: list[hvo.Step]) -> list[np.ndarray]:
         if step.corrected is not None:
             poses[number - 1] = step.corrected.T_world_cam
     return [poses[number] for number in range(len(steps))]
-
-
-def median_error_px(poses: list[np.ndarray]) -> float:
-    """Median error of the rotation from frame to frame, as a shift of the middle of the view."""
-    errors = []
-    for k in range(1, len(poses)):
-        there = [motion_until(PERIOD_S * at) for at in (k - 1, k)]
-        true = invert(there[1]) @ there[0]
-        found = invert(poses[k]) @ poses[k - 1]
-        errors.append(np.linalg.norm(se3_log(found @ invert(true))[3:]))
-    return float(120 * np.median(errors))
 
 
 @pytest.mark.slow

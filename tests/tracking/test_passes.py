@@ -20,7 +20,7 @@ from hybridvo.tracking.passes import (
     track_in_passes,
 )
 from tests.doors import refuses
-from tests.late_depth import PERIOD_S, motion_until, rolling_frames
+from tests.late_depth import PERIOD_S, median_error_px, rolling_frames, untold
 
 READOUT_MS = 20.0
 COUNT = 45
@@ -32,21 +32,9 @@ def rolled() -> list[hvo.Frame]:
     return rolling_frames(1, READOUT_MS, 0.0, COUNT)
 
 
-def untold(frames: list[hvo.Frame]) -> list[hvo.Frame]:
-    """The same frames, whose camera states no readout."""
-    camera = replace(frames[0].camera, readout_ms=0.0)
-    return [replace(frame, camera=camera) for frame in frames]
-
-
-def median_error_px(steps: list[Step]) -> float:
-    """Median error of the rotation from frame to frame, as a shift of the middle of the view."""
-    errors = []
-    for k in range(1, len(steps)):
-        poses = [motion_until(PERIOD_S * at) for at in (k - 1, k)]
-        true = invert(poses[1]) @ poses[0]
-        found = invert(steps[k].T_world_cam) @ steps[k - 1].T_world_cam
-        errors.append(np.linalg.norm(se3_log(found @ invert(true))[3:]))
-    return float(120 * np.median(errors))
+def error_px(steps: list[Step]) -> float:
+    """The median error of the path of some steps."""
+    return median_error_px([step.T_world_cam for step in steps])
 
 
 @pytest.mark.slow
@@ -55,7 +43,7 @@ def test_the_passes_find_the_readout_and_use_it(rolled) -> None:
     thrice = track_in_passes(untold(rolled), passes=3)
     assert once.times.readout is None
     assert thrice.times.readout_ms == pytest.approx(READOUT_MS, abs=2.0)
-    assert median_error_px(thrice.steps) < 0.6 * median_error_px(once.steps)
+    assert error_px(thrice.steps) < 0.6 * error_px(once.steps)
 
 
 @pytest.mark.slow
@@ -64,7 +52,7 @@ def test_a_stated_readout_is_believed(rolled) -> None:
     twice = track_in_passes(rolled, passes=2)
     assert twice.times.readout is None
     assert len(twice.times.velocities) == COUNT
-    assert median_error_px(twice.steps) < median_error_px(once.steps)
+    assert error_px(twice.steps) < error_px(once.steps)
 
 
 @pytest.mark.slow
