@@ -320,7 +320,6 @@ def clip_part(found: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
         "right": RIGHT,
         "far": FAR_OFF,
         "methods": by_method,
-        "rows": clips,
     }
 
 
