@@ -53,6 +53,7 @@ class Report(NamedTuple):
         covariance: (6, 6) of it, in the axes of odom.
         twist: the velocity, in the axes of the child.
         step: what the tracker returned.
+        T_odom_before: (4, 4) the pose of the frame before once more, with ``track.lag``; else None.
         moving: what moves; None where it is not known, or not wanted.
         restarts: how often tracking began anew.
     """
@@ -63,6 +64,7 @@ class Report(NamedTuple):
     covariance: np.ndarray
     twist: Twist
     step: Step
+    T_odom_before: np.ndarray | None
     moving: Moving | None
     restarts: int
 
@@ -154,6 +156,9 @@ class Follower:
         # nothing is known of it before the first motion, and where a lost path is found again:
         # that motion starts from a place of long ago
         velocity = Twist(np.zeros(6), UNINFORMATIVE_COVARIANCE)
+        T_odom_before = None
+        if step.corrected is not None and step.corrected.usable:
+            T_odom_before = pose_in_odom(step.corrected.T_world_cam, mount)
         moving = None
         if step.prev_index is not None and self._tracker.predict() is not None:
             # seconds since 1970 would have no more than a fraction of a microsecond
@@ -169,6 +174,7 @@ class Follower:
             pose_covariance(covariance, T_odom_child, mount),
             velocity,
             step,
+            T_odom_before,
             moving,
             self._restarts,
         )

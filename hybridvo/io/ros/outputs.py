@@ -49,9 +49,7 @@ def fill_odometry(message: Any, report: Report, odom_frame: str) -> None:
     message.header.stamp = report.header.stamp
     message.header.frame_id = odom_frame
     message.child_frame_id = report.child
-    pose = message.pose.pose
-    _fill_xyz(pose.position, report.T_odom_child[:3, 3])
-    _fill_rotation(pose.orientation, report.T_odom_child)
+    _fill_pose(message.pose.pose, report.T_odom_child)
     message.pose.covariance = _row_by_row(report.covariance)
     velocity = report.twist.velocity
     _fill_xyz(message.twist.twist.linear, velocity[:3])
@@ -79,7 +77,7 @@ class RecentPath:
     """The latest poses, for a ``nav_msgs/Path``.
 
     Poses of motions that failed are left out: where the camera was then is not known. Where
-    tracking begins anew the path does as well.
+    tracking begins anew the path does as well. With ``track.lag`` the pose before is put right.
 
     Args:
         length: How many poses are kept.
@@ -94,20 +92,27 @@ class RecentPath:
         self._make_pose = make_pose
         self._poses: deque[Any] = deque(maxlen=length)
         self._restarts = 0
+        # of the frame whose pose is the newest
+        self._newest: int | None = None
 
     def add(self, report: Report) -> None:
         """Go on by a frame."""
         if report.restarts != self._restarts:
             self._poses.clear()
         self._restarts = report.restarts
-        if not report.step.usable:
+        step = report.step
+        T_before = report.T_odom_before
+        if step.corrected is not None and T_before is not None:
+            if step.corrected.index == self._newest and self._poses:
+                _fill_pose(self._poses[-1].pose, T_before)
+        if not step.usable:
             return
         stamped = self._make_pose()
         stamped.header.stamp = report.header.stamp
         stamped.header.frame_id = self._odom_frame
-        _fill_xyz(stamped.pose.position, report.T_odom_child[:3, 3])
-        _fill_rotation(stamped.pose.orientation, report.T_odom_child)
+        _fill_pose(stamped.pose, report.T_odom_child)
         self._poses.append(stamped)
+        self._newest = step.index
 
     def fill(self, message: Any, report: Report) -> None:
         """Fill a ``nav_msgs/Path``, with the stamp of a frame."""
@@ -268,6 +273,12 @@ def _marker(message: Any, report: Report, thing: MovingObject | None = None) -> 
 def _at_least(size: np.ndarray) -> list[float]:
     """The sides of a box, metres; RViz refuses those that are 0."""
     return np.maximum(size, SMALLEST_BOX_M).tolist()
+
+
+def _fill_pose(message: Any, T: np.ndarray) -> None:
+    """Fill a ``Pose`` with (4, 4)."""
+    _fill_xyz(message.position, T[:3, 3])
+    _fill_rotation(message.orientation, T)
 
 
 def _fill_xyz(message: Any, values: np.ndarray) -> None:

@@ -44,6 +44,11 @@ def header(types: Types, seconds: int = 7, nanoseconds: int = 90) -> Any:
     return types.make("std_msgs/msg/Header", stamp=time, frame_id="optical")
 
 
+def step_of(index: int, motion: RelativePose | None = None) -> Step:
+    motion = motion or RelativePose(np.eye(4), np.diag([4e-4] * 3 + [1e-4] * 3))
+    return Step(index, index / 30, np.eye(4), motion, index - 1)
+
+
 def report(types: Types, motion: RelativePose | None = None) -> Report:
     motion = motion or RelativePose(np.eye(4), np.diag([4e-4] * 3 + [1e-4] * 3))
     return Report(
@@ -54,8 +59,29 @@ def report(types: Types, motion: RelativePose | None = None) -> Report:
         Twist(np.arange(1.0, 7.0), np.diag([1.0, 2, 3, 4, 5, 6])),
         Step(12, 7.0, np.eye(4), motion, 11),
         None,
+        None,
         2,
     )
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_a_path_holds_poses_as_they_were_put_right(
+    types: Types, failed: bool
+) -> None:
+    path = outputs.RecentPath(
+        9, "odom", lambda: types.make("geometry_msgs/msg/PoseStamped")
+    )
+    failure = RelativePose.failed(Reason.NO_FLOW, "dark") if failed else None
+    path.add(report(types))
+    path.add(report(types, failure)._replace(step=step_of(13, failure)))
+    moved = make_transform(np.eye(3), np.array([7.0, 8, 9]))
+    after = replace(step_of(14), corrected=step_of(13))
+    path.add(report(types)._replace(step=after, T_odom_before=moved))
+    message = types.make("nav_msgs/msg/Path")
+    path.fill(message, report(types))
+    got = [pose.pose.position.x for pose in types.sent(message).poses]
+    # what failed is not in the path, and the pose before it stays
+    assert got == ([1, 1] if failed else [1, 7, 1])
 
 
 def test_odometry(types: Types) -> None:
