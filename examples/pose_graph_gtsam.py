@@ -48,12 +48,12 @@ def build(
 
 if __name__ == "__main__":
     sequence = hvo.open_sequence(sys.argv[1])
+    truth = hvo.Trajectory(sequence.timestamps, sequence.poses)
     times = hvo.track_in_passes(sequence).times  # of a rolling shutter
     tracker = hvo.Odometry(options=hvo.Options(track={"places": 200}))
     graph, tracked = build(map(times.frame, sequence), tracker)
     found = gtsam.LevenbergMarquardtOptimizer(graph, tracked).optimize()
-    truth = hvo.Trajectory(sequence.timestamps, sequence.poses)
     for poses in (tracked, found):
-        path = [poses.atPose3(index).matrix() for index in tracked.keys()]
-        stamps = truth.timestamps[list(tracked.keys())]
-        print(hvo.evaluate(hvo.Trajectory(stamps, path), truth)["ate_rmse"])
+        T = [poses.atPose3(index).matrix() for index in tracked.keys()]
+        path = hvo.Trajectory(truth.timestamps[list(tracked.keys())], T)
+        print(f"ATE {1000 * hvo.evaluate(path, truth)['ate_rmse']:.1f} mm")

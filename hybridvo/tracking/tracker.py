@@ -349,7 +349,7 @@ class Tracker:
         is computed from the images. A loop is a motion from a place that looks like the frame. The
         images show it in both directions, and where the path leads is not asked. So where a scene
         repeats itself, a loop may be wrong: give it a robust kernel. Each place that looks alike,
-        at most three, costs one motion or two. No later step depends on this call.
+        at most three, costs one motion or two: a second. No later step depends on this call.
 
         Args:
             step: of the last frame.
@@ -357,11 +357,12 @@ class Tracker:
 
         Returns:
             Sure motions to ``step.index``, each from the frame of a place, metres; their
-            covariances also cover the motion backwards. Empty where no place fits, and where the
-            step failed.
+            covariances also cover the motion backwards. Empty where no place fits, where the step
+            failed, and where no later motion may start from the frame.
 
         Raises:
-            InputError: for a step that is not that of the last frame, and for another type.
+            InputError: for a usable step that is not that of the last frame, for a number below 0,
+                and for another type.
 
         Example:
             >>> import hybridvo as hvo
@@ -371,6 +372,12 @@ class Tracker:
             [0]
         """
         check_kind("Odometry.loops", step, Step)
+        if not as_number(apart) >= 0:
+            raise InputError(
+                f"Odometry.loops: apart: expected frames from 0 on, got {apart!r}."
+            )
+        if not step.usable:
+            return ()
         last = self.state.sensors.last
         if last is None or step.index != last.index:
             known = "no frame" if last is None else f"frame {last.index}"
@@ -378,12 +385,8 @@ class Tracker:
                 f"Odometry.loops: expected the step of the last frame, got that of frame "
                 f"{step.index} after {known}. Call it after each track."
             )
-        if not as_number(apart) >= 0:
-            raise InputError(
-                f"Odometry.loops: apart: expected frames from 0 on, got {apart!r}."
-            )
         frame = self.state.frame
-        if frame is None or frame.index != step.index or not step.usable:
+        if frame is None or frame.index != step.index:
             return ()
         return tuple(loops_to_reference(self._setup, self.state, apart))
 

@@ -122,6 +122,7 @@ def test_a_frame_that_fails_closes_no_loop(frames) -> None:
     step = vo.track(dark)
     assert not step.usable
     assert vo.loops(step, apart=1) == ()
+    assert vo.loops(vo.skip(3, 0.1), apart=1) == ()
 
 
 def test_only_the_last_step_is_asked_for_loops(frames) -> None:
