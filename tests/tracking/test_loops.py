@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hybridvo as hvo
 from hybridvo.core.geometry import invert, se3_exp, se3_log
+from hybridvo.run.commands.stored_state import restored, saved
 from hybridvo.tracking import loops
 from hybridvo_lab.synthetic.slow_scenes import slow_scene
 
@@ -156,3 +159,12 @@ def test_as_many_places_are_kept_as_the_options_say() -> None:
     assert first == 0 and kept[1] == [later]
     with pytest.raises(hvo.InputError, match="places"):
         hvo.Options(track={"places": 201})
+
+
+def test_a_run_goes_on_with_as_many_places_as_the_options_allow(tracked) -> None:
+    vo, _ = tracked
+    places = vo.state.places[:1] * hvo.Options(track={"places": 200}).track.places
+    text = json.dumps(saved(replace(vo.state, places=places)))
+    frames = SimpleNamespace(frame=lambda index: places[0].frame)
+    again = restored(json.loads(text), frames)
+    assert len(again.places) == 200
