@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # what type checkers and editors see of the names below
     from hybridvo.io.data.open import open_sequence as open_sequence
     from hybridvo.io.data.resize import resize_frame as resize_frame
     from hybridvo.io.example import example_frames as example_frames
+    from hybridvo.io.g2o import write_g2o as write_g2o
     from hybridvo.network.pwvo import PWVO as PWVO
     from hybridvo.network.selection import select as select
     from hybridvo.odometry import Odometry as Odometry
@@ -73,6 +74,7 @@ _HOME = {
         "io.data.open": "open_sequence iter_pairs",
         "io.data.resize": "resize_frame",
         "io.example": "example_frames",
+        "io.g2o": "write_g2o",
         "flow.providers": "FlowField dis_flow",
         "tracking.chains": "chain_covariance to_g2o_information",
         "tracking.inertial": "gyro_prior",

@@ -18,7 +18,8 @@ class Odometry(Tracker):
     A frame from which no motion can start (it has hardly any depth, or its own motion failed) is
     passed over: the next motion spans it. Where flow is computed from the images, motions are
     estimated from a keyframe some steps back and given between neighbouring frames. Where the
-    path is lost, the motion is also sought from one of ten earlier places. No pose is revised.
+    path is lost, the motion is also sought from one of ten earlier places. No pose is revised;
+    :meth:`loops` measures what revises poses in a pose graph.
 
     Args:
         network: ``default`` (pretrained), None for the classical refinement alone, the name or

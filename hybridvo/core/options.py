@@ -29,6 +29,8 @@ NonNegative = Annotated[float, Field(ge=0)]
 """A number from 0 on."""
 Count = Annotated[int, Field(ge=1, lt=2**31)]
 """A whole number from 1 on."""
+Places = Annotated[int, Field(ge=1, le=200)]
+"""A number of places: more would fill a gigabyte with frames of 640x480."""
 Natural = Annotated[int, Field(ge=0, lt=2**31)]
 """A whole number from 0 on."""
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -226,6 +228,9 @@ class TrackOptions:
             keyframes.
         objects: ``off``, or ``auto``: what moves by itself is told apart, with its motion, where
             frames have images and depth.
+        places: earlier frames, far apart, that are kept at most, 200 or fewer: from them a lost
+            path is found again, and :meth:`hybridvo.Odometry.loops` measures loops. At 640x480
+            each takes 6 MB, and 0.07 ms a frame.
         on_failure: the pose after a motion that failed: ``hold`` or ``constant_velocity``.
         lag: with 1, a step is given at once, and again one frame later, when it is known how the
             camera moved while the rows of the image were exposed; the readout is sought where the
@@ -240,6 +245,7 @@ class TrackOptions:
     keyframes: AutoOff = "auto"
     memory: AutoOff = "auto"
     objects: AutoOff = "off"
+    places: Places = 10
     on_failure: Literal["hold", "constant_velocity"] = "hold"
     lag: Literal[0, 1] = 0
     budget_ms: NonNegative | None = None

@@ -18,9 +18,6 @@ from hybridvo.core.types import Frame
 from hybridvo.tracking.calibration import ALIKE_PLACES, MIN_LIKENESS, PLACE_DISTANCE
 from hybridvo.tracking.keyframes import Keyframe
 
-# Earlier frames that are kept to find a lost path again.
-PLACES = 10
-
 # columns of the small images that are compared
 WIDTH = 40
 # part of a small image that is sought in another one, along each side
@@ -28,23 +25,24 @@ CORE = 0.6
 
 
 def with_place(
-    places: Sequence[Keyframe], keyframe: Keyframe
+    places: Sequence[Keyframe], keyframe: Keyframe, most: int
 ) -> tuple[Keyframe, ...]:
     """Add a keyframe to the places if it is far from each of them.
 
     Args:
         places: oldest first.
         keyframe: a frame whose motion was sure.
+        most: so many are kept.
 
     Returns:
-        The places, at most :data:`PLACES`; the oldest one makes room.
+        The places; the oldest one makes room.
     """
     T_cam_world = invert(keyframe.T_world_cam)
     for place in places:
         flow = mean_flow(place.frame, T_cam_world @ place.T_world_cam)
         if flow < PLACE_DISTANCE:
             return tuple(places)
-    return (*places, keyframe)[-PLACES:]
+    return (*places, keyframe)[-most:]
 
 
 def similar_places(places: Sequence[Keyframe], frame: Frame) -> list[Keyframe]:

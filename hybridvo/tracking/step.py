@@ -146,7 +146,7 @@ def keep(
         after = replace(
             after,
             keyframes=(*after.keyframes, new),
-            places=with_place(after.places, new),
+            places=with_place(after.places, new, setup.options.track.places),
         )
     else:
         new = replace(state.unsure(frame, new.T_world_cam), is_sure=found.ok)

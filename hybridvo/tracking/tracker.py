@@ -19,6 +19,7 @@ from hybridvo.core.geometry import ego_flow, invert, se3_exp
 from hybridvo.core.imu import ImuSamples
 from hybridvo.core.options import Options
 from hybridvo.core.results import (
+    Edge,
     MotionPrior,
     Reason,
     RelativePose,
@@ -39,6 +40,7 @@ from hybridvo.network.models import Models, default_models
 from hybridvo.tracking.accelerometer import Accelerometer
 from hybridvo.tracking.camera_drift import Mean
 from hybridvo.tracking.gyroscope import Gyroscope
+from hybridvo.tracking.loops import loops_to_reference
 from hybridvo.tracking.readout import ReadoutFinder, Taken, surely_ms
 from hybridvo.tracking.repeated import repeat_of
 from hybridvo.tracking.search import Arrival, Setup
@@ -339,6 +341,54 @@ class Tracker:
         """How motions are found, by the options of now."""
         context = replace(self._context, options=self.options)
         return Setup(self.method, context)
+
+    def loops(self, step: Step, apart: int = 30) -> tuple[Edge, ...]:
+        """Measure the loops that the last frame closes.
+
+        The frame is compared with the places that are kept: ``track.places`` of them, where flow
+        is computed from the images. A loop is a motion from a place that looks like the frame. The
+        images show it in both directions, and where the path leads is not asked. So where a scene
+        repeats itself, a loop may be wrong: give it a robust kernel. Each place that looks alike,
+        at most three, costs one motion or two: a second. No later step depends on this call.
+
+        Args:
+            step: of the last frame.
+            apart: frames from a place to this one at least.
+
+        Returns:
+            Sure motions to ``step.index``, each from the frame of a place, metres; their
+            covariances also cover the motion backwards. Empty where no place fits, where the step
+            failed, and where no later motion may start from the frame.
+
+        Raises:
+            InputError: for a usable step that is not that of the last frame, for a number below 0,
+                and for another type.
+
+        Example:
+            >>> import hybridvo as hvo
+            >>> vo = hvo.Odometry(network=None)
+            >>> steps = [vo.track(frame) for frame in hvo.example_frames()]
+            >>> [edge.start for edge in vo.loops(steps[-1], apart=2)]
+            [0]
+        """
+        check_kind("Odometry.loops", step, Step)
+        if not as_number(apart) >= 0:
+            raise InputError(
+                f"Odometry.loops: apart: expected frames from 0 on, got {apart!r}."
+            )
+        if not step.usable:
+            return ()
+        last = self.state.sensors.last
+        if last is None or step.index != last.index:
+            known = "no frame" if last is None else f"frame {last.index}"
+            raise InputError(
+                f"Odometry.loops: expected the step of the last frame, got that of frame "
+                f"{step.index} after {known}. Call it after each track."
+            )
+        frame = self.state.frame
+        if frame is None or frame.index != step.index:
+            return ()
+        return tuple(loops_to_reference(self._setup, self.state, apart))
 
     def _deadline(self) -> float | None:
         """When the time of a frame is over, on the clock of ``time.perf_counter``."""

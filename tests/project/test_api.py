@@ -26,7 +26,7 @@ BatchedPose Camera Edge FlowField Frame FramePair Gravity ImuSamples
 InputError MotionPrior MovingObject Odometry Options PWVO PairBatch PoseSeed Reason
 RelativePose Rival State Status Step Trajectory chain_covariance dis_flow estimate
 evaluate example_frames gyro_prior iter_pairs open_sequence refine resize_frame select
-to_g2o_information to_gtsam_covariance to_ros_covariance track_in_passes
+to_g2o_information to_gtsam_covariance to_ros_covariance track_in_passes write_g2o
 """.split()
 )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import cv2
@@ -11,13 +12,16 @@ import numpy as np
 import pytest
 
 from hybridvo import Camera, Frame, open_sequence
+from hybridvo.core.geometry import invert, se3_exp
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.io.masks import mask_of
 from hybridvo.run.cli import main
 from hybridvo.run.commands.export.colmap import write_colmap
 from hybridvo.run.commands.export.euroc import write_euroc
+from hybridvo.run.commands.export.run_export import RunExport
 from hybridvo.run.commands.export.transforms import write_transforms
 from hybridvo.run.commands.export.views import ColouredPoints, PosedImage, points_of
+from hybridvo.tracking.depth_scale import scale_factors
 
 CAMERA = Camera(fx=100.0, fy=110.0, cx=31.5, cy=23.5, height=48, width=64)
 TURNED = np.array([[0.0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]])
@@ -242,7 +246,7 @@ def check(out: Path, sequence: Path) -> Model:
 @pytest.mark.slow
 def test_a_run_is_exported(dataset: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
-    kinds = "colmap,transforms,euroc"
+    kinds = "colmap,transforms,euroc,g2o"
     assert run(dataset, out, "--export", kinds, "--json") == 0
     summary = json.loads(capsys.readouterr().out)["export"]
     assert (summary["images"], summary["left_out"]) == (6, 0)
@@ -257,6 +261,60 @@ def test_a_run_is_exported(dataset: Path, tmp_path: Path, capsys) -> None:
     np.testing.assert_allclose(points[:, 2], depth, rtol=1e-4)
     rows = (out / "export" / "euroc.csv").read_text().splitlines()
     assert len(rows) == 7
+    graph = (out / "export" / "graph.g2o").read_text().splitlines()
+    assert [line.split()[0] for line in graph] == [
+        *["VERTEX_SE3:QUAT"] * 6,
+        "FIX",
+        *["EDGE_SE3:QUAT"] * 5,
+    ]
+    # the path that the motions lead along
+    poses = read_trajectory(out / "trajectory.tum").T_world_cam
+    for line in graph[7:]:
+        start, end, *numbers = line.split()[1:]
+        T_start_end = invert(poses[int(start)]) @ poses[int(end)]
+        moved = [float(number) for number in numbers[:3]]
+        np.testing.assert_allclose(moved, T_start_end[:3, 3], atol=1e-8)
+
+
+def test_the_graph_of_depth_with_a_scale_of_its_own(tmp_path: Path) -> None:
+    """Its motions are as long as those of the path, and as uncertain."""
+    scales = np.array([1.0, 1.2, 0.9])
+    changes = np.array([1.0, 1.1, 1.0])
+    factors = scale_factors(scales, changes)
+    assert factors[1] != 1
+    ahead = se3_exp(np.array([0, 0, -1.0, 0, 0, 0]))
+    columns = {
+        "index": np.arange(3),
+        "edge_start": np.array([0, 0, 1]),
+        "T_curr_start": np.stack([np.eye(4), ahead, ahead]),
+        "edge_covariance": np.stack([np.eye(6)] * 3),
+        "depth_scale": scales,
+        "scale_change": changes,
+        "status": np.array(["ok"] * 3),
+    }
+    np.savez(tmp_path / "steps.npz", **columns)
+    path = Trajectory(np.arange(3.0), np.stack([np.eye(4)] * 3))
+    path.save(tmp_path / "trajectory.tum")
+    sequence = SimpleNamespace(T_cam_frame=None)
+    RunExport(tmp_path, ["g2o"], sequence, "new").finish()
+    lines = (tmp_path / "export" / "graph.g2o").read_text().splitlines()
+    for line, factor in zip(lines[4:], factors[1:], strict=True):
+        numbers = [float(number) for number in line.split()[3:]]
+        np.testing.assert_allclose(numbers[:3], [0, 0, factor], atol=1e-12)
+        diagonal = np.array(numbers[7:])[[0, 15]]
+        np.testing.assert_allclose(diagonal, [1 / factor**2, 4.0])
+
+
+def test_what_is_exported_is_the_cameras_path(tmp_path: Path) -> None:
+    """Also where the path of another frame was asked for, such as the robot's base."""
+    T_cam_frame = se3_exp(np.array([0.1, 0, -0.3, 0, 0.5, 0]))
+    camera = Trajectory(np.arange(2.0), np.stack([np.eye(4), TURNED]))
+    camera.of_frame(T_cam_frame).save(tmp_path / "trajectory.tum")
+    sequence = SimpleNamespace(T_cam_frame=T_cam_frame)
+    RunExport(tmp_path, ["euroc"], sequence, "new").finish()
+    last = (tmp_path / "export" / "euroc.csv").read_text().splitlines()[-1]
+    place = [float(number) for number in last.split(",")[1:4]]
+    np.testing.assert_allclose(place, TURNED[:3, 3], atol=1e-6)
 
 
 @pytest.mark.slow

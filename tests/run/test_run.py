@@ -99,7 +99,7 @@ def test_columns_and_arrays(dataset, tmp_path):
     columns += " cost flow_ms motion_ms frame_ms"
     assert list(table[0])[:17] == columns.split()
     numbers = ("index", "timestamp", "status", "probability", "edge_start")
-    shapes = dict.fromkeys(numbers, (3,))
+    shapes = dict.fromkeys((*numbers, "depth_scale", "scale_change"), (3,))
     shapes |= dict.fromkeys(("T_curr_prev", "T_curr_start"), (3, 4, 4))
     shapes |= dict.fromkeys(("covariance", "edge_covariance"), (3, 6, 6))
     with np.load(tmp_path / "steps.npz") as steps:

@@ -15,6 +15,7 @@ from hybridvo_lab.synthetic.draws import affine, random_rotation
 from hybridvo_lab.synthetic.raycast import BOX, CYLINDER, ELLIPSOID
 from hybridvo_lab.synthetic.render import Scene, Solid
 from hybridvo_lab.synthetic.slow_scenes import noisy_image
+from tests.scripts import load_script
 
 SIZE = (120, 160)
 SEED = 1
@@ -148,3 +149,40 @@ def test_a_place_that_looks_like_no_other_is_found(walk, state):
     assert step.prev_index < len(walk.positions) - 4
     before = BAY_WIDTH * (walk.positions[step.prev_index] - ALIKE[0])
     assert invert(step.T_curr_prev)[0, 3] == pytest.approx(true - before, abs=0.05)
+
+
+def there_and_back(walk: Walk) -> list[hvo.Frame]:
+    """The frames of a walk past both, and back."""
+    along = walk.positions[:-4]
+    both_ways = [*along, *along[:-1][::-1]]
+    return [walk.frame(each, 0.03 * k) for k, each in enumerate(both_ways)]
+
+
+def test_a_loop_is_measured_to_each_of_two_places_that_look_alike(walk):
+    """The images do not tell them apart; the path does, which loops are not asked about."""
+    vo = hvo.Odometry()
+    for frame in there_and_back(walk):
+        step = vo.track(frame)
+        assert step.ok
+    x = BAY_WIDTH * walk.positions
+    off = [
+        x[0] - x[edge.start] - edge.T_start_curr[0, 3]
+        for edge in vo.loops(step, apart=8)
+    ]
+    true = [each for each in off if abs(each) < 0.01]
+    elsewhere = [each for each in off if abs(abs(each) - BAY_WIDTH) < 0.01]
+    assert true and elsewhere and len(true) + len(elsewhere) == len(off)
+
+
+@pytest.mark.slow
+def test_a_robust_kernel_leaves_out_loops_to_what_only_looks_alike(walk):
+    gtsam = pytest.importorskip("gtsam")
+    example = load_script("examples/pose_graph_gtsam.py")
+    graph, tracked = example.build(there_and_back(walk), hvo.Odometry(), apart=18)
+    assert graph.size() > tracked.size()
+    found = gtsam.LevenbergMarquardtOptimizer(graph, tracked).optimize()
+    moved = [
+        found.atPose3(key).translation() - tracked.atPose3(key).translation()
+        for key in tracked.keys()
+    ]
+    assert np.linalg.norm(moved, axis=1).max() < 0.01

@@ -415,7 +415,7 @@ RUN = command(
     VIEW,
     word(
         "--export KINDS",
-        "images, masks and poses for colmap, transforms, euroc (comma-separated)",
+        "images, masks and poses for colmap, transforms, euroc, g2o (comma-separated)",
         type=names,
         default=(),
     ),

@@ -95,6 +95,8 @@ ARRAYS = (
     "edge_start",
     "T_curr_start",
     "edge_covariance",
+    "depth_scale",
+    "scale_change",
 )
 """The columns of the steps that ``steps.npz`` holds."""
 RUN_FIELDS = (
@@ -145,7 +147,7 @@ def run(
         view: ``spawn`` shows the run in a viewer while it goes on, ``connect:HOST:PORT`` in one
             that runs already, ``serve`` in a browser.
         picture: Whether the trajectory is drawn.
-        export: Which of ``colmap``, ``transforms`` and ``euroc`` is written into ``export``.
+        export: Which of ``colmap``, ``transforms``, ``euroc``, ``g2o`` is written into ``export``.
 
     Returns:
         A summary, JSON-ready, and the exit code: 3 where too many motions failed.

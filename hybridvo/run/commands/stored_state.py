@@ -50,8 +50,8 @@ LONG_ARRAY = 64
 """Numbers from which an array is packed: the state is written after every frame."""
 MOST_BYTES = 2**29
 """To which a state unpacks: of sixteen objects in images of two megapixels."""
-MOST_FRAMES = 100
-"""Frames that a state holds; a tracker keeps some twenty."""
+MOST_FRAMES = 250
+"""Frames that a state holds; a tracker keeps some ten beside its places, which are 200 at most."""
 NUMBERS = "fiub"
 """Kinds of numpy's types that are read."""
 

@@ -10,11 +10,13 @@ import numpy as np
 
 from hybridvo.core.errors import InputError
 from hybridvo.core.files import make_folder, remove
-from hybridvo.core.results import MovingObject, Step
+from hybridvo.core.geometry import invert
+from hybridvo.core.results import Edge, MovingObject, Step
 from hybridvo.core.trajectory import Trajectory, read_trajectory
 from hybridvo.core.types import Frame
 from hybridvo.io.data.image_io import read_mask_png, write_png
 from hybridvo.io.data.sequence import Sequence as FrameSequence
+from hybridvo.io.g2o import write_g2o
 from hybridvo.io.masks import mask_of, numbers_of
 from hybridvo.run.commands.export.colmap import MODEL, write_colmap
 from hybridvo.run.commands.export.euroc import write_euroc
@@ -29,14 +31,16 @@ from hybridvo.run.commands.export.views import (
     PosedImage,
     points_of,
 )
+from hybridvo.tracking.depth_scale import lengthened, scale_factors
 
-KINDS = ("colmap", "transforms", "euroc")
+KINDS = ("colmap", "transforms", "euroc", "g2o")
 FOLDER = "export"
 IMAGES = "images"
 MASKS = "masks"
 OBJECTS = "objects"
 SPARSE = "sparse/0"
 PATH = "euroc.csv"
+GRAPH = "graph.g2o"
 MAX_POINT_FRAMES = 50
 """Frames whose depth gives points."""
 
@@ -102,9 +106,14 @@ class RunExport:
         written without knowing what moves.
         """
         trajectory = read_trajectory(self.out / "trajectory.tum")
+        if self.sequence.T_cam_frame is not None:
+            # the path of that frame was written
+            trajectory = trajectory.of_frame(invert(self.sequence.T_cam_frame))
         make_folder(self.folder)
         if "euroc" in self.kinds:
             write_euroc(self.folder / PATH, trajectory)
+        if "g2o" in self.kinds:
+            self._write_graph(trajectory)
         summary: dict[str, Any] = {
             "folder": str(self.folder),
             "kinds": [*self.kinds],
@@ -123,6 +132,38 @@ class RunExport:
             "left_out": len(trajectory) - len(views),
             "points": len(points.xyz),
         }
+
+    def _write_graph(self, trajectory: Trajectory) -> None:
+        """Write the motions as they were measured, all in the scale of the trajectory.
+
+        A motion that failed keeps the graph in one piece, and carries hardly any information.
+        """
+        with np.load(self.out / "steps.npz", allow_pickle=False) as steps:
+            indices = steps["index"].tolist()
+            factors = scale_factors(steps["depth_scale"], steps["scale_change"])
+            scales = np.repeat(
+                np.stack([factors, np.ones(len(factors))], 1), 3, axis=1
+            )
+            edges = [
+                (
+                    index,
+                    Edge(
+                        start, lengthened(T, scale[0]), scale[:, None] * C * scale
+                    ),
+                )
+                for index, start, T, C, scale in zip(
+                    indices,
+                    steps["edge_start"].tolist(),
+                    steps["T_curr_start"],
+                    steps["edge_covariance"],
+                    scales,
+                    strict=True,
+                )
+                # the first frame is joined to itself
+                if start != index
+            ]
+        poses = dict(zip(indices, trajectory.T_world_cam, strict=True))
+        write_g2o(self.folder / GRAPH, poses, edges)
 
     def _views(
         self, trajectory: Trajectory
@@ -194,7 +235,13 @@ def clear_export(out: Path) -> None:
 
 def _files(folder: Path) -> Iterator[Path]:
     """The files of an export that are there."""
-    for name in (*(f"{SPARSE}/{name}" for name in MODEL), TRANSFORMS, CLOUD, PATH):
+    for name in (
+        *(f"{SPARSE}/{name}" for name in MODEL),
+        TRANSFORMS,
+        CLOUD,
+        PATH,
+        GRAPH,
+    ):
         if (folder / name).is_file():
             yield folder / name
     for name in (IMAGES, MASKS, OBJECTS):
