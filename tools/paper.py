@@ -107,7 +107,10 @@ def main(argv: list[str] | None = None) -> int:
         score_cards(argv)
         return 0
     if args.rules:
-        store(args.out, provenance("paper.py", argv) | rules_of_shipped(args.pairs))
+        rules = rules_of_shipped(args.pairs)
+        for name, errors in (rules["rules"] | rules["rows"]).items():
+            print(f"{name}: EPE {errors['epe']:.3f} px")
+        store(args.out, provenance("paper.py", argv) | rules)
         return 0
     if args.ablation is None:
         parser.error("expected --ablation DIR, the output of tools/ablation.py")

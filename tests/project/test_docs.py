@@ -170,7 +170,7 @@ def test_the_model_card_has_what_the_weights_were_made_of():
     card = json.loads((PRETRAINED / "pwvo.json").read_text(encoding="utf-8"))
     for run in (card, card["began_with"]):
         assert f"{run['updates']} updates" in page
-        assert f"{run['samples']} samples" in page
+        assert f"{run['samples']} presentations" in page
     named = re.findall(r"data/[\w/]+\w", card["recordings"])
     sources = [
         source.path for place in SPLITS["train"].values() for source in place

@@ -104,7 +104,7 @@ start = time.perf_counter()
 used = time.process_time()
 import hybridvo as hvo
 assert hvo.__file__.startswith(os.environ["PYTHONPATH"])
-camera = hvo.Camera(*K, *depth.shape[1:])
+camera = hvo.Camera(*K, height=depth.shape[1], width=depth.shape[2])
 frames = []
 for index, images in enumerate(zip(rgb, depth)):
     frames.append(hvo.Frame(*images, camera, timestamp=index / 30))
