@@ -183,6 +183,7 @@ def test_a_worker_of_another_version_is_refused() -> None:
 # --- processes of this machine ----------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_task_of_a_killed_process_is_done_by_another(tmp_path: Path) -> None:
     found = sorted(Workers(jobs=2).each(partial(die_once, tmp_path), range(6)))
     assert found == [Done(number, number * number) for number in range(6)]
@@ -195,12 +196,14 @@ def test_the_task_of_a_killed_process_is_done_by_another(tmp_path: Path) -> None
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_task_of_which_every_process_dies_is_given_up() -> None:
     found = sorted(Workers(jobs=2).each(die, [0, 1, 2]))
     assert [done.result for done in found] == [0, None, 2]
     assert "4 processes died of it" in found[1].lost
 
 
+@pytest.mark.slow
 def test_processes_open_no_port() -> None:
     before = listening(0)
     found = [done.result for done in Workers(jobs=2).each(listening, [0, 1])]
@@ -225,6 +228,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_processes_end_with_the_one_that_started_them(
     number: int, tmp_path: Path
