@@ -48,6 +48,8 @@ from hybridvo.solver.refine_flow import Selection
 MAX_SCORE_MARGIN = 8.0
 # Fraction of the view that is added to a share before its logarithm is evidence.
 LEAST_SHARE = 0.01
+# Robust weight (Geman-McClure) of a pixel whose residual is at the cutoff: (1 / (1 + 1))^2.
+AT_CUTOFF = 0.25
 
 
 class ChoiceEvidence(NamedTuple):
@@ -182,8 +184,9 @@ class Ranking:
         return score_margin(self.found, self.poses, self.score)
 
     def followers_of(self, number: int) -> np.ndarray:
-        """(h, w) robust weights of a candidate, with which it is fitted to the end."""
-        return np.asarray(self.described(number).inliers, np.float32)
+        """(h, w) 1 where a pixel follows a candidate, which is fitted there to the end; else 0."""
+        follows = self.described(number).inliers >= AT_CUTOFF
+        return follows.astype(np.float32)
 
     def described(self, number: int) -> Hypothesis:
         """A candidate with its inliers."""
