@@ -391,6 +391,11 @@ class LiveStream:
         gravity = {}
         if self._gravity is not None:
             gravity["gravity"] = self._gravity.summary()
+        readout = {}
+        found_ms = getattr(self._odometry, "readout_ms", 0.0)
+        if found_ms:
+            readout["readout_ms"] = found_ms
+            readout["readout_std_ms"] = self._odometry.readout.std
         return {
             "camera": self._camera.name,
             "camera_frames_per_second": self._rate_hz,
@@ -411,6 +416,7 @@ class LiveStream:
             "age_ms_p95": self.age_ms(95),
             "stages": stage_summary(self._stages),
             **gravity,
+            **readout,
         }
 
     def help(self) -> str:

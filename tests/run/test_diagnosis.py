@@ -77,7 +77,8 @@ def test_the_offset_of_the_clocks_is_found(late_ms: int) -> None:
     assert ms == pytest.approx(abs(late_ms), abs=4)
     assert std <= 5
     if late_ms:
-        sign = "" if late_ms > 0 else "-"
+        # depth that comes late was measured early
+        sign = "-" if late_ms > 0 else ""
         assert f"pass --depth-lag-ms {sign}{ms}" in answer.message
 
 
@@ -314,7 +315,7 @@ def test_the_doctor_looks_at_a_camera(monkeypatch, capsys) -> None:
     assert "turn it to and fro" in shown.err
     lines = shown.out.splitlines()
     clocks = next(line for line in lines if "clocks" in line)
-    assert clocks.startswith("DIFFERS") and "--depth-lag-ms 6" in clocks
+    assert clocks.startswith("DIFFERS") and "--depth-lag-ms -6" in clocks
     rate = next(line for line in lines if "rate of the camera" in line)
     assert "30 frames a second; 30 requested" in rate
 

@@ -50,7 +50,8 @@ ADVICE = {
     ),
     Reason.NO_FLOW: (
         "no flow could be computed, or the given one does not fit the images; see that the images "
-        "are there and have texture, and check the sign, the unit and the frames of your flow"
+        "are there and have texture, that no frames between them were dropped, and, if the flow is "
+        "yours, its sign, unit and frames"
     ),
     Reason.MISSING_FRAME: "the files cannot be read; the messages above name them",
     Reason.NOT_RIGID: "a moving object bends or falls apart; its mask holds, its motion does not",

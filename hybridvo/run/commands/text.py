@@ -83,7 +83,10 @@ def _run_text(content: Content) -> list[str]:
     lines.append(_labelled("status", f"{failed}, {content['degraded']} degraded"))
     lines += [_labelled("doubt", warning) for warning in content["doubts"]]
     if content.get("readout_ms"):
-        lines.append(_labelled("rolling shutter", _readout_text(content)))
+        text = _readout_text(content)
+        if content["passes"] == 1:
+            text = f"{text}; --passes 3 takes it out"
+        lines.append(_labelled("rolling shutter", text))
     if content["frame_ms_median"] is not None:
         lines.append(_labelled("time", _time_text(content)))
     if content["metrics"]:
@@ -110,8 +113,7 @@ def _run_text(content: Content) -> list[str]:
 def _readout_text(content: Content) -> str:
     """State how long the rows of an image take, by what the images show."""
     readout = f"{content['readout_ms']:.0f} +- {content['readout_std_ms']:.0f} ms"
-    text = f"{readout} from the first row to the last, by turns of the camera"
-    return text if content["passes"] > 1 else f"{text}; --passes 3 takes it out"
+    return f"{readout} from the first row to the last, by turns of the camera"
 
 
 def _next(least_sure: Content, command: str) -> list[str]:
@@ -144,6 +146,8 @@ def _live_text(content: Content) -> list[str]:
     if content["frames_per_second"] is not None:
         rate = f"{content['frames_per_second']:.1f} frames/s"
         lines.append(_labelled("rate", rate))
+    if content.get("readout_ms"):
+        lines.append(_labelled("rolling shutter", _readout_text(content)))
     if content["unusable"]:
         lines.append(_labelled("unusable", f"{content['unusable']} frames"))
     p50 = content["age_ms_p50"]

@@ -11,6 +11,7 @@ import numpy as np
 import hybridvo as hvo
 from hybridvo.io.cameras.base import EndOfFrames, Reading
 from hybridvo.io.live import LiveStream, Patience
+from hybridvo.tracking.camera_drift import Mean
 from hybridvo.tracking.keyframes import Keyframe
 from hybridvo.tracking.tracker_state import TrackerState
 
@@ -95,6 +96,8 @@ class Tracker:
         self.samples: list[hvo.ImuSamples | None] = []
         self.set_poses: list[np.ndarray] = []
         self.on_track: Callable[[int], None] = lambda count: None
+        self.readout: Mean | None = None
+        self.readout_ms = 0.0
 
     def warm_up(self) -> None:
         """Nothing is compiled."""

@@ -19,6 +19,7 @@ from hybridvo.io.live import (
     Patience,
     stream,
 )
+from hybridvo.tracking.camera_drift import Mean
 from tests.io.live.scripted import (
     LONG_S,
     QUICK,
@@ -310,3 +311,14 @@ def test_frames_that_cannot_be_used_are_said_once() -> None:
         "scripted: frames again after 3 that could not be used",
     ]
     assert not steps.is_gone
+
+
+@pytest.mark.parametrize("surely_ms", [0.0, 25.0])
+def test_a_readout_that_was_found_is_in_the_summary(surely_ms: float) -> None:
+    tracker = Tracker()
+    tracker.readout = Mean(25.0, 1.5, 40)
+    tracker.readout_ms = surely_ms
+    steps, _, _ = run(ScriptedCamera(reading(1.0), reading(1.1)), tracker)
+    summary = steps.summary()
+    stated = (summary.get("readout_ms"), summary.get("readout_std_ms"))
+    assert stated == ((25.0, 1.5) if surely_ms else (None, None))

@@ -110,7 +110,8 @@ def _remedy(sequence: Any, ms: float) -> tuple[str, str]:
         frames = np.sign(ms) * np.floor(abs(ms) / frame_ms + WHOLE_FRAME)
         if frames:
             return "--depth-offset-ms", f"{frames * frame_ms:.0f}"
-    return "--depth-lag-ms", f"{ms:.0f}"
+    # a map that comes late shows what was there before
+    return "--depth-lag-ms", f"{-ms:.0f}"
 
 
 # -- the motion of images ----------------------------------------------------------------
