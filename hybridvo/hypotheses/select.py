@@ -1,8 +1,9 @@
 """The stage *select*: which motion of a pair is the camera's, and where the scene is static.
 
 Either hand-made cues decide, or a scorer, which is PWVO. The scorer scores the motions of
-the search, and draws a static mask for the best of them. Each of these is fitted again inside
-its mask, and then all motions are scored once more.
+the search; for the best of them it selects a pose from the poses of all pixels, and draws
+a static mask. From this pose each of these is fitted again inside its mask, and then all
+motions are scored once more.
 """
 
 from __future__ import annotations
@@ -48,8 +49,6 @@ from hybridvo.solver.refine_flow import Selection
 MAX_SCORE_MARGIN = 8.0
 # Fraction of the view that is added to a share before its logarithm is evidence.
 LEAST_SHARE = 0.01
-# Robust weight (Geman-McClure) of a pixel whose residual is at the cutoff: (1 / (1 + 1))^2.
-AT_CUTOFF = 0.25
 
 
 class ChoiceEvidence(NamedTuple):
@@ -84,22 +83,34 @@ class CueEvidence(NamedTuple):
     log_ratio_alone: float
 
 
+class RefitStart(NamedTuple):
+    """Where a candidate is fitted again.
+
+    Attributes:
+        pose: (3, 4) ``T_curr_prev`` from which the fit starts, metres.
+        static: (h, w) probability of each pixel to be static if that candidate is the
+            camera's motion.
+    """
+
+    pose: np.ndarray
+    static: np.ndarray
+
+
 class Scores(NamedTuple):
     """A scorer's answer about N candidates.
 
     Attributes:
         score: (N,); the candidate with the largest one is the camera's motion. ``NO_MOTION``
             is the score of "none of them".
-        static: for some of the candidates, the best first: the (h, w) probability of each pixel
-            to be static if that candidate is the camera's motion. They are fitted again there.
+        refits: for some of the candidates, the best first: where to fit them again.
     """
 
     score: np.ndarray
-    static: dict[int, np.ndarray]
+    refits: dict[int, RefitStart]
 
 
 Scorer = Callable[[Sequence[Candidate], int], Scores]
-"""Scores candidates; of as many as the second argument states it draws the static mask.
+"""Scores candidates; of as many as the second argument states it returns where to fit them again.
 
 A later call repeats the candidates of an earlier one, and appends others.
 """
@@ -153,12 +164,15 @@ class Ranking:
         found: the motions of the search, and their pixels.
         candidates: these motions, and some of them fitted again.
         score: (N,) of the candidates, finite or minus infinity.
+        static: (h, w) probability of each pixel to be static if a candidate is the camera's
+            motion, for the candidates that were drawn.
         remembered: (N,) what earlier frames added to the scores; None where nothing was known.
     """
 
     found: HypothesisSet
     candidates: list[Candidate]
     score: np.ndarray
+    static: Mapping[int, np.ndarray]
     remembered: np.ndarray | None = None
 
     @property
@@ -183,10 +197,21 @@ class Ranking:
             return MAX_SCORE_MARGIN
         return score_margin(self.found, self.poses, self.score)
 
-    def followers_of(self, number: int) -> np.ndarray:
-        """(h, w) 1 where a pixel follows a candidate, which is fitted there to the end; else 0."""
-        follows = self.described(number).inliers >= AT_CUTOFF
-        return follows.astype(np.float32)
+    def mask_of(self, number: int) -> np.ndarray | None:
+        """(h, w) weights of a candidate's static pixels, with which it is fitted to the end.
+
+        A motion of the search gets the mask that was drawn for it; where that leaves too little,
+        the pixels that follow it.
+        """
+        candidate = self.candidates[number]
+        if candidate.mask is not None:
+            return candidate.mask
+        drawn = self.static.get(number)
+        if drawn is not None:
+            mask = mask_weights(drawn)
+            if mask_coverage(self.found.grid, mask) >= MIN_COVERAGE:
+                return mask
+        return np.asarray(self.described(number).inliers, np.float32)
 
     def described(self, number: int) -> Hypothesis:
         """A candidate with its inliers."""
@@ -234,7 +259,7 @@ def select_from(rankings: Sequence[Ranking]) -> Selection:
         chosen.candidates,
         chosen.score,
         evidence,
-        chosen.followers_of(chosen.best),
+        chosen.mask_of(chosen.best),
         chosen.remembered,
     )
 
@@ -283,7 +308,7 @@ def select_rival(
         on_choice.log_share,
     )
     candidate = look.candidates[number]
-    mask = look.followers_of(number)
+    mask = look.mask_of(number)
     return look, Selection(
         T_curr_prev=pose_matrix(candidate.pose),
         noise=Noise(*candidate.noise),
@@ -328,7 +353,7 @@ def rank_by_scorer(
     candidates = search_candidates(found)
     first = scorer(candidates, options.select.refits)
     score = first.score
-    refits = _refit(found, candidates, first.static)
+    refits = _refit(found, candidates, first.refits)
     if refits:
         candidates += refits
         score = scorer(candidates, 0).score
@@ -337,8 +362,9 @@ def rank_by_scorer(
         inliers = [each.inliers for each in to_hypotheses(found, candidates)]
         remembered = memory_scores(found, inliers, belief)
         score = score + remembered
+    static = {number: start.static for number, start in first.refits.items()}
     finite = np.nan_to_num(score, nan=-np.inf)
-    return Ranking(found, candidates, finite, remembered)
+    return Ranking(found, candidates, finite, static, remembered)
 
 
 def search_candidates(found: HypothesisSet) -> list[Candidate]:
@@ -361,19 +387,19 @@ def cue_candidates(found: HypothesisSet) -> list[Candidate]:
 def _refit(
     found: HypothesisSet,
     candidates: Sequence[Candidate],
-    static: Mapping[int, np.ndarray],
+    starts: Mapping[int, RefitStart],
 ) -> list[Candidate]:
     """Fit candidates inside their masks; without those whose mask leaves too little."""
     grid = found.grid
     refits = []
-    for number, probability in static.items():
-        mask = mask_weights(probability)
+    for number, start in starts.items():
+        mask = mask_weights(start.static)
         if mask_coverage(grid, mask) < MIN_COVERAGE:
             continue
-        start = candidates[number]
         refit = fit_in_mask(grid.samples, mask, grid.K, start.pose, found.cutoff)
         if np.isfinite(refit.pose).all() and refit.inlier_ratio > 0:
-            refits.append(refit._replace(parent=start.parent))
+            parent = candidates[number].parent
+            refits.append(refit._replace(parent=parent, mask=mask))
     return refits
 
 

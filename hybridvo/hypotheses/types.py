@@ -38,6 +38,7 @@ class Candidate(NamedTuple):
         source: the kind of candidate that it was fitted from.
         iterations: Gauss-Newton steps spent on it.
         parent: number of the motion of the search that it goes back to, or its own.
+        mask: (h, w) weights with which a refit was made; None for motions of the search.
     """
 
     pose: np.ndarray
@@ -47,6 +48,7 @@ class Candidate(NamedTuple):
     source: MotionSource
     iterations: int = 0
     parent: int = 0
+    mask: np.ndarray | None = None
 
     @property
     def noise(self) -> tuple[float, float]:

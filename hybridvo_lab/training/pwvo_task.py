@@ -29,6 +29,7 @@ from hybridvo.network.hypothesis_inputs import (
 )
 from hybridvo.network.hypothesis_maps import FirstLook, HypothesisMaps, Looks
 from hybridvo.network.pwvo import PWVO
+from hybridvo.network.scorer import selected_poses
 from hybridvo.solver import kernels
 from hybridvo_lab.training import ranks
 from hybridvo_lab.training.hypothesis_samples import MOVING, STATIC, expected_motion
@@ -255,8 +256,8 @@ def refits_of(
 ) -> HypothesisInputs | None:
     """Fit the ``count`` best motions of every sample inside their masks, as new hypotheses.
 
-    In some samples one motion is drawn by lot, so that the training covers more than the best
-    ones.
+    The fits start from the poses that are selected from those of all pixels. In some
+    samples one motion is drawn by lot, so that the training covers more than the best ones.
 
     Args:
         batch: the samples, with their motions.
@@ -268,7 +269,7 @@ def refits_of(
     inputs = batch.inputs
     cutoff = RefineOptions().cutoff
     probability = torch.sigmoid(maps.static).numpy()
-    starts = inputs.pose.double().numpy()
+    starts = selected_poses(maps.motion, maps.log_scale)
     poses = []
     noise = []
     parents = []

@@ -19,6 +19,7 @@ from hybridvo.hypotheses.calibration import NO_MOTION
 from hybridvo.hypotheses.generate import generate, static_grid
 from hybridvo.hypotheses.select import (
     Candidate,
+    RefitStart,
     Scores,
     rank_by_scorer,
     score_margin,
@@ -36,18 +37,30 @@ IDENTITY = np.eye(4)[None]
 
 
 class Oracle:
-    """A scorer that is told where the scene is static; it prefers the latest refit, or none."""
+    """A scorer that is told where the scene is static; it prefers the latest refit, or none.
+
+    Fits start from the motion of the search, or from ``start``.
+    """
 
     def __init__(
-        self, static: np.ndarray, refits: bool, margin: float = 5.0
+        self,
+        static: np.ndarray,
+        refits: bool,
+        margin: float = 5.0,
+        start: np.ndarray | None = None,
     ) -> None:
         self.static, self.refits, self.margin = static, refits, margin
+        self.start = start
 
     def __call__(self, candidates: Sequence[Candidate], refits: int) -> Scores:
         count = len(candidates)
         score = np.zeros(count)
         score[-1 if self.refits else 0] = self.margin
-        return Scores(score, dict.fromkeys(range(min(refits, count)), self.static))
+        starts = {}
+        for number in range(min(refits, count)):
+            pose = candidates[number].pose if self.start is None else self.start
+            starts[number] = RefitStart(pose, self.static)
+        return Scores(score, starts)
 
 
 @pytest.fixture(scope="module")
