@@ -31,11 +31,6 @@ be ok to count. By hand."""
 ALIKE_PLACES = 3
 """Places that are tried, those that look most alike first: where a scene repeats itself each fits,
 and none is believed. By hand: each costs a motion."""
-SAME_MOTION = 0.005
-"""Mean ego flow between the motion of a loop and that measured backwards, as a fraction of the
-image's width, below which they are the same. By hand: true loops of a Kinect that turns are within
-0.004; two views of other rooms that look alike (``real_static/rooms_110``, frames 46 and 93) 0.6
-apart."""
 CHANGE_DECAY = 0.9
 """Factor on the weight of earlier changes of the motion with every new one. By hand, as the
 next three; ``make golden`` shows the effect of a change."""

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from hybridvo import pipeline
-from hybridvo.core.geometry import mean_flow
 from hybridvo.core.results import Edge, RelativePose
 from hybridvo.core.types import Frame, FramePair
 from hybridvo.judge.findings import covering
-from hybridvo.tracking.calibration import SAME_MOTION
-from hybridvo.tracking.relocalization import similar_places
+from hybridvo.tracking.relocalization import are_apart, similar_places
 from hybridvo.tracking.search import Setup
 from hybridvo.tracking.tracker_state import TrackerState
 
@@ -42,7 +42,7 @@ def loops_to_reference(
             continue
         back = motion_between(setup, curr, place.frame)
         T_apart = there.T_curr_prev @ back.T_curr_prev
-        if back.usable and mean_flow(curr, T_apart) < SAME_MOTION:
+        if back.usable and not are_apart(curr, T_apart, np.eye(4)):
             covariance = there.covariance + covering(T_apart)
             yield Edge(place.frame.index, there.T_curr_prev, covariance)
 
